@@ -10,7 +10,7 @@ import numpy as np
 from lslam.core.geometry import geodesy, se2
 from lslam.core.types.arrays import Floats
 from lslam.core.types.building import Building, BuildingCorrection, BuildingStatus, CorrectedMap
-from lslam.simulation.osm_perturb import Perturbation, join_outlines, perturb, simplify_outlines
+from lslam.simulation.osm_extract import Perturbation, join_outlines, perturb, simplify_outlines
 
 HELD = 0.6  # m; one sigma along an axis below which walls hold it: a building that nothing holds has 1 m
 

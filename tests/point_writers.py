@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from lzf_compressor import compress
 from numpy.typing import NDArray
 
 from lslam.core.types.cloud import ArrayCloud
@@ -14,7 +15,6 @@ from lslam.io.formats.atomic import atomic_write
 from lslam.io.formats.pcd_files import pcd_header
 from lslam.io.formats.point_cloud import float_table
 from lslam.io.formats.point_files import write_bin, write_cloud
-from lslam.io.kernels.lzf import compress
 
 PERIOD_S = 0.1
 ENCODINGS = ("binary", "ascii", "binary_compressed")

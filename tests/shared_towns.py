@@ -17,11 +17,10 @@ import numpy as np
 from lslam.core.types.scan import Scan
 from lslam.simulation import built_scenario
 from lslam.simulation.city import City
-from lslam.simulation.curve import RouteCurve
+from lslam.simulation.curve import RouteCurve, Terrain
 from lslam.simulation.scenario_files import Scenario
 from lslam.simulation.scenarios import SimulatedDrive
 from lslam.simulation.scene_mesh import RayScene, SceneMesh
-from lslam.simulation.terrain import Terrain
 from lslam.studies.worker import ScanStore
 
 HELD = 5  # towns, of some 100 MB each with what rays need

@@ -107,7 +107,7 @@ def test_flags_exist(shown: Page) -> None:
 
 def test_configuration_keys_exist() -> None:
     from lslam.core.config import load_config
-    from lslam.simulation.scenario_files import scenario_named
+    from lslam.simulation.scenario_files import find_scenario
 
     lines = [line for shown in PAGES for line in shown.shell_lines()]
     # Of `simulate` they are a scenario's.
@@ -115,7 +115,7 @@ def test_configuration_keys_exist() -> None:
     simulated = [line for line in lines if line.startswith("lslam simulate") and "--set" in line]
     assert simulated
     for line in simulated:
-        scenario_named(line.split()[2], re.findall(r"--set (\S+)", line))
+        find_scenario(line.split()[2], re.findall(r"--set (\S+)", line))
     assert settings
     load_config(None, settings, {})
     variables = {name for shown in PAGES for name in re.findall(r"LSLAM_[A-Z_]+", shown.text)} - {"LSLAM_DATA"}

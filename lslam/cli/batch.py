@@ -88,7 +88,7 @@ def _line(number: int, words: list[str], given: dict[str, Any]) -> RunLine:
     from lslam.cli.one_run import read_truth
     from lslam.cli.run import command as run_command
     from lslam.cli.run import opened_with, resolved
-    from lslam.io.readers.lookup import find_folder
+    from lslam.io.readers import find_folder
     from lslam.studies.batch import listed_line, opened_line, refused_line
 
     try:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lslam.cli import options
-from lslam.io.formats.trajectory_formats import FORMATS
+from lslam.io.formats.trajectory_files import FORMATS
 
 if TYPE_CHECKING:
     from lslam.core.types.sequence import Calibration, Sequence
@@ -283,7 +283,7 @@ def _read_trajectory(source: str, kind: str, given: dict[str, Any]) -> tuple[Tra
     """The trajectory of the file, or the ground truth of the sequence, and the calibration between the bodies."""
     from lslam.core.errors import InputError
     from lslam.core.types.sequence import Calibration
-    from lslam.io.formats.calibration_files import read_cam0_lidar, read_transform
+    from lslam.io.formats.kitti_layout import read_cam0_lidar, read_transform
     from lslam.io.formats.trajectory_files import read_trajectory
 
     if _is_trajectory(source):

@@ -49,8 +49,7 @@ def command(out: Path, no_open: bool, **given: Any) -> None:
         start_helper(Config(), if_cold=True)
         with progress("opening"):
             from lslam.simulation.scenarios import simulate
-            from lslam.simulation.sensors import GnssModel
-            from lslam.simulation.wheels import WheelModel
+            from lslam.simulation.sensors import GnssModel, WheelModel
 
             drive = simulate(
                 SCENARIO, lidar=LIDAR, count=SCANS, imu="icm20948", gnss=GnssModel(1.0), wheels=WheelModel()

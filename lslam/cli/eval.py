@@ -10,7 +10,7 @@ import click
 from lslam.cli import options
 from lslam.core.errors import UsageError, nearest
 from lslam.evaluation import ALIGNMENTS, check_words, parse_delta
-from lslam.io.formats.trajectory_formats import FORMATS
+from lslam.io.formats.trajectory_files import FORMATS
 
 if TYPE_CHECKING:
     from lslam.core.config.outputs import EvalConfig
@@ -146,7 +146,7 @@ def _evaluate_all(
 ) -> list[Evaluation]:
     from lslam.core.errors import InputError
     from lslam.evaluation.evaluate import evaluate
-    from lslam.io.formats.calibration_files import read_transform
+    from lslam.io.formats.kitti_layout import read_transform
     from lslam.io.formats.trajectory_files import read_trajectory
 
     ground_truth = read_trajectory(truth, given["gt_format"], given["times"])
@@ -171,19 +171,19 @@ def _evaluate_all(
 def _calibration(truth: Path, calib: Path | None) -> Calibration:
     """The calibration of --calib, or what lies at KITTI's place for this ground truth."""
     from lslam.core.types.sequence import Calibration
-    from lslam.io.formats import calibration_files
+    from lslam.io.formats import kitti_layout
     from lslam.io.formats.sequence_toml import FILE_NAME, SequenceInfo, read_sequence_toml
     from lslam.io.readers.sidecars import calibration_over
 
     if calib is not None:
         if calib.suffix == ".toml":
             return calibration_over(read_sequence_toml(calib), Calibration())
-        return Calibration(T_cam0_lidar=calibration_files.read_cam0_lidar(calib))
+        return Calibration(T_cam0_lidar=kitti_layout.read_cam0_lidar(calib))
     above = truth.resolve().parent
     for folder in (above, above.parent / "sequences" / truth.stem):
         tr, said = folder / "calib.txt", folder / FILE_NAME
         if tr.is_file() or said.is_file():
-            T_cam0_lidar = calibration_files.read_odometry_calib(tr) if tr.is_file() else None
+            T_cam0_lidar = kitti_layout.read_odometry_calib(tr) if tr.is_file() else None
             info = read_sequence_toml(said) if said.is_file() else SequenceInfo()
             return calibration_over(info, Calibration(T_cam0_lidar))
     return Calibration()
@@ -210,7 +210,7 @@ def _hold_gates(evaluations: list[Evaluation], given: dict[str, Any]) -> None:
             gate = given.get(f"fail_{metric.gate_option}")
             if gate is None:
                 continue
-            name, value, unit = metric.gated(e)
+            name, value, unit = metric.gate_value(e)
             if value is None or not value <= gate:
                 number = "n/a" if value is None else f"{value:.4g} {unit}"
                 broken.append(f"{name} of {e.estimate} is {number}, --fail-{metric.gate_option} allows {gate:g} {unit}")

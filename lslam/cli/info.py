@@ -167,7 +167,7 @@ def _show_topics(bag: dict[str, Any]) -> None:
 def _show_bag(name: str, data_root: Path | None, error: str | None) -> None:
     """Show the content of a bag that is no sequence, as JSON with the `error` or as a page; nothing if there is no bag."""
     from lslam.core.errors import LslamError
-    from lslam.io.readers.lookup import find_folder
+    from lslam.io.readers import find_folder
 
     try:
         find_folder(name, data_root)

@@ -212,7 +212,7 @@ def _facts(extract: BuildingExtract) -> dict[str, Any]:
         "south_west": [round(float(v), 7) for v in fixes[0, :2]],
         "north_east": [round(float(v), 7) for v in fixes[1, :2]],
         "size_m": [round(float(v), 1) for v in high - low],
-        "left_out": dict(extract.skipped),
+        "left_out": dict(extract.omissions),
         "attribution": extract.attribution,
     }
 

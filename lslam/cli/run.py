@@ -126,7 +126,7 @@ def opened_with(given: dict[str, Any], meanwhile: Callable[[Config], None] | Non
 
     Cheap checks come first: words, then the configuration, then the sequence. `meanwhile` begins what takes long beside the last.
     """
-    from lslam.io.readers.lookup import find_folder
+    from lslam.io.readers import find_folder
 
     flags = _flags(given)
     extract = None if given["osm"] in (None, "auto") else Path(given["osm"])

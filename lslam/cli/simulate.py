@@ -92,7 +92,7 @@ if TYPE_CHECKING:
 @click.option("--reverse", is_flag=True, help="Drive in the opposite direction, on the other lane.")
 @click.option("--from", "shift", type=float, default=0.0, metavar="M", help="Begin so far along the line.")
 @click.option("--static-start", type=float, default=0.0, metavar="S", help="Stay at the start for S seconds first.")
-@click.option("--labels", "is_labelled", is_flag=True, help="Write the class of every point, as SemanticKITTI has it.")
+@click.option("--labels", "has_labels", is_flag=True, help="Write the class of every point, as SemanticKITTI has it.")
 @click.option("--camera", "is_filmed", is_flag=True, help="Record a camera that looks ahead, one image a scan.")
 @click.option("--overwrite", is_flag=True, help="Replace sequences/00 and poses/00.txt in an existing folder.")
 @click.option("--resume", is_flag=True, help="Continue an interrupted simulation.")
@@ -122,7 +122,7 @@ def command(
     reverse: bool,
     shift: float,
     static_start: float,
-    is_labelled: bool,
+    has_labels: bool,
     is_filmed: bool,
     overwrite: bool,
     resume: bool,
@@ -160,8 +160,7 @@ def command(
     at = None if origin is None else _numbers(origin)
     from lslam.simulation.routes import Visit
     from lslam.simulation.scenarios import simulate
-    from lslam.simulation.sensors import GnssModel
-    from lslam.simulation.wheels import WheelModel
+    from lslam.simulation.sensors import GnssModel, WheelModel
 
     if plan is not None and out is None and osm is not None and path_file is None:
         _print([_draw_map(scenario, seed, settings, osm, at, plan)], as_json)
@@ -187,7 +186,7 @@ def command(
     if plan is not None:
         written.append(_draw(drive, plan))
     if out is not None:
-        written.append(record_drive(drive, out, overwrite, resume, is_labelled, is_filmed))
+        written.append(record_drive(drive, out, overwrite, resume, has_labels, is_filmed))
     _print(written, as_json)
 
 
@@ -228,12 +227,12 @@ def _draw_map(
     from lslam.simulation.built_scenario import whole_map
     from lslam.simulation.osm_place import read_extract
     from lslam.simulation.plan import plan_of
-    from lslam.simulation.scenario_files import scenario_named
+    from lslam.simulation.scenario_files import find_scenario
     from lslam.simulation.scenarios import checked_origin
     from lslam.simulation.scene_mesh import RayScene
 
     extract = read_extract(osm, None if origin is None else checked_origin(origin))
-    city, line = whole_map(scenario_named(scenario, settings), seed, extract)
+    city, line = whole_map(find_scenario(scenario, settings), seed, extract)
     return _write_plan(plan, plan_of(RayScene(city.mesh), city, line))
 
 
@@ -251,7 +250,7 @@ def record_drive(
     out: Path,
     overwrite: bool,
     resume: bool = False,
-    is_labelled: bool = False,
+    has_labels: bool = False,
     is_filmed: bool = False,
 ) -> Written:
     """Record the drive in `out` with a progress bar, until a signal comes; arguments as of the command."""
@@ -270,7 +269,7 @@ def record_drive(
             stop.check()
 
         command = shlex.join(["lslam", *sys.argv[1:]])
-        done = record(drive, out, overwrite, on_scan, resume, command, is_labelled, on_image if is_filmed else None)
+        done = record(drive, out, overwrite, on_scan, resume, command, has_labels, on_image if is_filmed else None)
     assert drive.ground_truth is not None
     length = float(drive.ground_truth.path_lengths[-1])
     return Written(
@@ -287,23 +286,23 @@ def record_drive(
 
 
 def _print_scenario(name: str, settings: tuple[str, ...], as_json: bool) -> None:
-    from lslam.simulation.scenario_files import scenario_named, scenario_text
+    from lslam.simulation.scenario_files import find_scenario, scenario_text
 
-    text = scenario_text(scenario_named(name, settings))
+    text = scenario_text(find_scenario(name, settings))
     click.echo(json.dumps({"scenario": name, "toml": text}) + "\n" if as_json else text, nl=False)
 
 
 def _print_list(as_json: bool) -> None:
     from lslam.simulation.imu import IMUS
     from lslam.simulation.lidar_models import LIDARS
-    from lslam.simulation.scenario_files import scenario_named, scenario_names
+    from lslam.simulation.scenario_files import find_scenario, scenario_names
 
     if as_json:
-        names = {name: scenario_named(name).summary for name in scenario_names()}
+        names = {name: find_scenario(name).summary for name in scenario_names()}
         click.echo(json.dumps({"scenarios": names, "lidars": list(LIDARS), "imus": list(IMUS)}))
         return
     for name in scenario_names():
-        click.echo(f"scenario  {name:<16}  {scenario_named(name).summary}")
+        click.echo(f"scenario  {name:<16}  {find_scenario(name).summary}")
     for name, model in LIDARS.items():
         click.echo(f"lidar     {name:<16}  {model.rings} x {model.columns} rays, {model.range_max:g} m")
     for name, imu in IMUS.items():

@@ -32,16 +32,16 @@ def parse_delta(text: str) -> tuple[float, str, str]:
 
     Without a rule, scans are compared consecutively, metres and seconds over all pairs. Raises UsageError.
     """
-    found = re.fullmatch(r"\s*([0-9.]+(?:[eE][-+]?\d+)?)\s*([a-z]*)\s*(?:/\s*(consecutive|all))?\s*", text)
-    unit = UNIT_NAMES.get(found.group(2)) if found else None
+    match = re.fullmatch(r"\s*([0-9.]+(?:[eE][-+]?\d+)?)\s*([a-z]*)\s*(?:/\s*(consecutive|all))?\s*", text)
+    unit = UNIT_NAMES.get(match.group(2)) if match else None
     try:
-        value = float(found.group(1)) if found else 0.0
+        value = float(match.group(1)) if match else 0.0
     except ValueError:
         value = 0.0
-    if found is None or unit is None or not value > 0 or not math.isfinite(value):
+    if match is None or unit is None or not value > 0 or not math.isfinite(value):
         raise UsageError(
             f"RPE distance {text!r}: expected a number, scan|m|s and /consecutive or /all, for example 10m/all"
         )
     if unit == "scan" and value != int(value):
         raise UsageError(f"RPE distance {text!r}: scans are counted in whole numbers")
-    return value, unit, found.group(3) or ("consecutive" if unit == "scan" else "all")
+    return value, unit, match.group(3) or ("consecutive" if unit == "scan" else "all")

@@ -132,18 +132,10 @@ class AbsoluteTrajectoryError(TrajectoryMetric[dict[str, AbsoluteError]]):
                     with_decimals(error.percent_of_length, 2),
                 )
             )
-        header = (
-            "alignment",
-            "rmse, m",
-            "mean, m",
-            "median, m",
-            "std, m",
-            "max, m",
-            "horizontal rmse, m",
-            "vertical rmse, m",
-            "rotation rmse, deg",
-            "rmse, % of length",
+        lengths = (
+            f"{what}, m" for what in ("rmse", "mean", "median", "std", "max", "horizontal rmse", "vertical rmse")
         )
+        header = ("alignment", *lengths, "rotation rmse, deg", "rmse, % of length")
         alignments = "; ".join(f"{name}: {ALIGNMENTS.get(name, name)}" for name in self.of(e))
         recipe = f"{e.matched} of {e.possible} poses matched, path {e.path_length:.1f} m. {alignments}."
         return [Table("Absolute trajectory error (ATE)", header, tuple(rows), recipe)]
@@ -155,13 +147,13 @@ class AbsoluteTrajectoryError(TrajectoryMetric[dict[str, AbsoluteError]]):
             if error.available and error.translation is not None
         ]
 
-    def gated(self, e: Evaluation) -> tuple[str, float | None, str]:
+    def gate_value(self, e: Evaluation) -> tuple[str, float | None, str]:
         for error in self.of(e).values():
             if error.translation:
                 return f"ATE {error.alignment} rmse", error.translation.rmse, "m"
         return "ATE", None, "m"
 
-    def compared(self, configs: Sequence[EvalConfig]) -> list[Metric]:
+    def comparison_metrics(self, configs: Sequence[EvalConfig]) -> list[Metric]:
         names = list(dict.fromkeys(name for config in configs for name in config.align))
         main = [
             Metric(f"ate.{name}", f"ATE {name}", "m", "error", f"alignment {name}: {ALIGNMENTS[name]}; rmse over poses")

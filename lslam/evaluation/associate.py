@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,26 +110,15 @@ def _by_index(estimate: Trajectory, truth: Trajectory) -> Matches:
             f"{truth.source}; give the stamps of the KITTI file with --times, or use a format that has them (TUM)"
         )
     clock = truth if truth.has_stamps else estimate
-    return Matches(
-        estimate=estimate.poses,
-        truth=truth.poses,
-        stamps_ns=clock.stamps_ns,
-        seconds=_seconds(clock.stamps_ns) if clock.has_stamps else None,
-        possible=len(truth),
-        recipe=f"by index (line i with line i), because {who} no stamps",
-    )
+    recipe = f"by index (line i with line i), because {who} no stamps"
+    matches = _matches(estimate.poses, truth.poses, clock.stamps_ns, len(truth), recipe)
+    return matches if clock.has_stamps else replace(matches, seconds=None)
 
 
 def _nearest(estimate: Trajectory, stamps: Stamps, truth: Trajectory, limit: int) -> Matches:
     i, j = nearest_one_to_one(stamps, truth.stamps_ns, limit)
-    return Matches(
-        estimate=estimate.poses[i],
-        truth=truth.poses[j],
-        stamps_ns=truth.stamps_ns[j],
-        seconds=_seconds(truth.stamps_ns[j]),
-        possible=min(len(estimate), len(truth)),
-        recipe=f"nearest stamp, one to one, within {limit / 1e9:g} s",
-    )
+    possible, recipe = min(len(estimate), len(truth)), f"nearest stamp, one to one, within {limit / 1e9:g} s"
+    return _matches(estimate.poses[i], truth.poses[j], truth.stamps_ns[j], possible, recipe)
 
 
 def _interpolate(
@@ -147,14 +136,7 @@ def _interpolate(
     inside = (stamps >= known[0]) & (stamps <= known[-1]) & (gap <= hole)
     i = np.flatnonzero(inside | (nearest <= limit))
     truth_poses = se3.poses_at(known, truth.poses, stamps[i]) if len(i) else np.zeros((0, 4, 4))
-    return Matches(
-        estimate=estimate.poses[i],
-        truth=truth_poses,
-        stamps_ns=stamps[i],
-        seconds=_seconds(stamps[i]),
-        possible=len(estimate),
-        recipe=recipe,
-    )
+    return _matches(estimate.poses[i], truth_poses, stamps[i], len(estimate), recipe)
 
 
 def _is_denser(truth: Stamps, estimate: Stamps) -> bool:
@@ -164,11 +146,12 @@ def _is_denser(truth: Stamps, estimate: Stamps) -> bool:
     return not bool(np.isin(estimate, truth).all())
 
 
-def _seconds(stamps: Stamps) -> Floats:
-    return np.asarray((stamps - stamps[:1]) / 1e9, np.float64)
+def _matches(estimate: Floats, truth: Floats, stamps: Stamps, possible: int, recipe: str) -> Matches:
+    seconds = np.asarray((stamps - stamps[:1]) / 1e9, np.float64)
+    return Matches(estimate, truth, stamps, seconds, possible, recipe)
 
 
-def _no_overlap(estimate: Trajectory, stamps: Stamps, truth: Trajectory, found: int, max_diff: float) -> str:
+def _no_overlap(estimate: Trajectory, stamps: Stamps, truth: Trajectory, count: int, max_diff: float) -> str:
     ranges = (
         f"estimate {estimate.source} covers {stamps[0] / 1e9:.3f} .. {stamps[-1] / 1e9:.3f} s, "
         f"ground truth {truth.source} {time_range(truth)}"
@@ -181,7 +164,7 @@ def _no_overlap(estimate: Trajectory, stamps: Stamps, truth: Trajectory, found: 
         )
     else:
         way_out = "they share no time: try --time-offset auto (or seconds) if one clock is shifted"
-    return f"only {found} poses match within {max_diff:g} s, {LEAST_POSES} are needed: {ranges}; {way_out}"
+    return f"only {count} poses match within {max_diff:g} s, {LEAST_POSES} are needed: {ranges}; {way_out}"
 
 
 def estimate_offset(estimate: Trajectory, truth: Trajectory) -> tuple[int, float]:

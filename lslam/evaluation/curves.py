@@ -28,7 +28,7 @@ BAND_LEVEL = 0.99  # as the bands of Girolimetto's figure 5.19
 _ROUNDS = 5
 
 
-def two_sided(level: float, freedom: ArrayLike) -> Floats:
+def t_half_width(level: float, freedom: ArrayLike) -> Floats:
     """Half width of the two-sided interval of confidence `level`, in standard errors, by Student's t of `freedom` degrees.
 
     As `scipy.stats.t.ppf`, whose import takes longer than the rest of a study's evaluation.
@@ -159,7 +159,7 @@ def over_seeds(table: Floats, level: float = CONFIDENCE) -> Interval:
     several = n > 1
     std, error = np.full(len(n), np.nan), np.full(len(n), np.nan)
     std[several] = np.sqrt(squares[several] / (n[several] - 1))
-    error[several] = std[several] / np.sqrt(n[several]) * two_sided(level, n[several] - 1)
+    error[several] = std[several] / np.sqrt(n[several]) * t_half_width(level, n[several] - 1)
     return Interval(mean, mean - error, mean + error, n, std)
 
 
@@ -197,19 +197,19 @@ def optimum(values: Floats, means: Floats, *, is_highest_best: bool = True) -> O
     return Optimum(float(values[best]), float(values[low]), float(values[high]))
 
 
-def elbow(values: Floats, errors: Floats, is_lost: Bools) -> float | None:
+def elbow(values: Floats, errors: Floats, lost_mask: Bools) -> float | None:
     """Value from which on the error is on its plateau, None when it is not even at the largest value.
 
     The plateau is the median error of the upper half of the values; errors up to 1.5 times that belong to it.
 
     errors : (V,) nan where unknown
     """
-    known = np.isfinite(errors) | is_lost
-    values, errors, is_lost = values[known], errors[known], is_lost[known]
-    upper = errors[len(errors) // 2 :][~is_lost[len(errors) // 2 :]]
+    known = np.isfinite(errors) | lost_mask
+    values, errors, lost_mask = values[known], errors[known], lost_mask[known]
+    upper = errors[len(errors) // 2 :][~lost_mask[len(errors) // 2 :]]
     if not len(upper):
         return None
-    good = ~is_lost & (np.nan_to_num(errors, nan=np.inf) <= ELBOW * np.median(upper))
+    good = ~lost_mask & (np.nan_to_num(errors, nan=np.inf) <= ELBOW * np.median(upper))
     bad = np.flatnonzero(~good)
     first = int(bad[-1]) + 1 if len(bad) else 0
     return float(values[first]) if first < len(values) else None
@@ -261,25 +261,21 @@ def contrast(first: Floats, second: Floats) -> Contrast:
     return Contrast(float(logs.mean()), float(logs.std(ddof=1)), n)
 
 
-def errors_of(curve: Curve) -> Floats:
-    """(V, S) translation rmse of the runs that were not lost, m; nan for the others."""
-    return np.where(curve.losses, np.nan, curve.quantities["translation"])
+def valid_runs(curve: Curve, name: str = "translation") -> Floats:
+    """(V, S) a quantity of the runs that were not lost, by default the translation rmse, m; nan for the others."""
+    return np.where(curve.losses, np.nan, curve.quantities[name])
 
 
 def plateau(curve: Curve, value: float) -> Floats:
     """(S,) median error of each seed from a value on, m; nan where it has none."""
-    errors = errors_of(curve)[curve.values >= value]
-    known = np.isfinite(errors).any(0)
-    out = np.full(errors.shape[1], np.nan)
-    out[known] = np.nanmedian(errors[:, known], axis=0)
-    return out
+    return median_over_seeds(valid_runs(curve)[curve.values >= value].T)
 
 
 def rise_at(curve: Curve, index: int, level: Floats) -> Rise:
     """Whether the error at a value is worse than a level (S,), m; a value at which most runs are lost is worse."""
     if curve.loses_most[index]:
         return "worse"
-    ratio = contrast(errors_of(curve)[index], level)
+    ratio = contrast(valid_runs(curve)[index], level)
     return "worse" if ratio.is_more else "as good" if ratio.is_no_more else "unknown"
 
 
@@ -320,14 +316,14 @@ def fit_law(
         return None
     columns = design(kind, x)
     coefficients, weights = _fit(columns, t, n)
-    expected = columns @ coefficients
+    law_times = columns @ coefficients
     freedom = len(t) - columns.shape[1]
     weighted = columns * weights[:, None]
-    variance = float(np.sum(((t - expected) * weights) ** 2) / freedom)
+    variance = float(np.sum(((t - law_times) * weights) ** 2) / freedom)
     covariance = np.asarray(variance * np.linalg.inv(weighted.T @ weighted), np.float64)
-    margins = float(two_sided(level, freedom)) * np.sqrt(np.diag(covariance))
-    r2 = _r2(t, expected)
-    return Law(kind, tuple(names), coefficients, margins, covariance, freedom, level, x, t, expected, r2, std)
+    margins = float(t_half_width(level, freedom)) * np.sqrt(np.diag(covariance))
+    r2 = _r2(t, law_times)
+    return Law(kind, tuple(names), coefficients, margins, covariance, freedom, level, x, t, law_times, r2, std)
 
 
 def law_over(kind: LawKind, curve: Curve, times: Interval) -> Law | None:
@@ -355,20 +351,20 @@ def _fit(columns: Floats, t: Floats, n: Floats) -> tuple[Floats, Floats]:
     """(P,) coefficients of columns (N, P), and the (N,) weights they were found with; n : (N,) runs."""
     from scipy.linalg import lstsq
 
-    expected = t
+    law_times = t
     coefficients, weights = np.zeros(columns.shape[1]), np.zeros(len(t))
     for _ in range(_ROUNDS):
         # A line may cross zero on its way: no weight is larger than that of the shortest time.
-        weights = np.sqrt(n) / np.maximum(expected, t.min())
+        weights = np.sqrt(n) / np.maximum(law_times, t.min())
         coefficients = lstsq(columns * weights[:, None], t * weights)[0]
-        expected = columns @ coefficients
+        law_times = columns @ coefficients
     return coefficients, weights
 
 
-def _r2(observed: Floats, expected: Floats) -> float:
+def _r2(times: Floats, law_times: Floats) -> float:
     """Coefficient of determination; nan where all observations are equal."""
-    spread = float(np.sum((observed - observed.mean()) ** 2))
-    return 1 - float(np.sum((observed - expected) ** 2)) / spread if spread > 0 else float("nan")
+    spread = float(np.sum((times - times.mean()) ** 2))
+    return 1 - float(np.sum((times - law_times) ** 2)) / spread if spread > 0 else float("nan")
 
 
 def design(kind: LawKind, points: Floats) -> Floats:
@@ -383,7 +379,7 @@ def band(law: Law, points: Floats) -> tuple[Floats, Floats]:
     """Value of the law at points (N,) or (N, K), and half width of its confidence band there, s."""
     columns = design(law.kind, _columns(points))
     deviation = np.sqrt(np.einsum("ni,ij,nj->n", columns, law.covariance, columns))
-    return columns @ law.coefficients, float(two_sided(law.level, law.freedom)) * deviation
+    return columns @ law.coefficients, float(t_half_width(law.level, law.freedom)) * deviation
 
 
 def _columns(points: Floats) -> Floats:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ from lslam.core.types.sequence import LIDAR_FRAME, Calibration
 from lslam.core.types.trajectory import Trajectory
 from lslam.evaluation.absolute import AbsoluteTrajectoryError, absolute_error
 from lslam.evaluation.associate import Matches, associate, estimate_offset
-from lslam.evaluation.frames import body_turn, carry, reconcile
+from lslam.evaluation.frames import CommonFrame, body_turn, carry, reconcile
 from lslam.evaluation.kitti_drift import KittiOdometry
 from lslam.evaluation.metric import Evaluation, MatchedPoses, TrajectoryMetric
 from lslam.evaluation.relative import RelativePoseError
@@ -47,7 +46,7 @@ UNLIKELY = 30.7
 
 def shown_metrics(evaluation: Evaluation) -> list[TrajectoryMetric[Any]]:
     """Metrics that are always shown, and those named in `eval.metrics`."""
-    return [metric for metric in METRICS if not metric.word or metric.word in evaluation.shown]
+    return [metric for metric in METRICS if not metric.word or metric.word in evaluation.words]
 
 
 def evaluate(
@@ -78,8 +77,7 @@ def evaluate(
     """
     config = config or EvalConfig()
     calibration = calibration or Calibration()
-    T_lidar_body = calibration.T_lidar(config.frame)
-    is_carried = config.frame != LIDAR_FRAME
+    calibration.T_lidar(config.frame)  # known, or an error before all others
     for which, trajectory in (("estimate", estimate), ("ground truth", ground_truth)):
         _check(which, trajectory)
     offset_ns, notes = _offset(estimate, ground_truth, config)
@@ -90,11 +88,49 @@ def evaluate(
     notes += [
         f"{which}: {note}" for which, t in (("estimate", estimate), ("ground truth", ground_truth)) for note in t.notes
     ]
-    if not (estimate.has_rotations and ground_truth.has_rotations):
-        if is_carried:
-            raise InputError(f"poses of {config.frame} need rotations of both trajectories: one has positions alone")
-        return _evaluate_positions(estimate, ground_truth, matches, config, T_est_gt, offset_ns / 1e9, notes)
-    truth = matches.truth
+    has_rotations = estimate.has_rotations and ground_truth.has_rotations
+    if has_rotations:
+        same, units = _in_one_frame(estimate, ground_truth, matches, config, T_est_gt, calibration)
+    elif config.frame != LIDAR_FRAME:
+        raise InputError(f"poses of {config.frame} need rotations of both trajectories: one has positions alone")
+    else:
+        same, units = _at_one_place(estimate, ground_truth, matches, T_est_gt)
+    P, Q, faults = same.estimate, same.truth, (*units, *same.faults)
+    notes = [*units, *notes, *same.notes, *same.faults, *_nearly_straight(Q, config)]
+    for note in notes:
+        log.log(logging.WARNING if note in faults else logging.INFO, "%s: %s", estimate.source or "estimate", note)
+    distance = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(Q[:, :3, 3], axis=0), axis=1))])
+    poses = MatchedPoses(P, Q, matches.seconds, has_rotations)
+    return Evaluation(
+        estimate=estimate.source or "estimate",
+        ground_truth=ground_truth.source or "ground truth",
+        matched=len(P),
+        possible=matches.possible,
+        stamps_ns=matches.stamps_ns,
+        distance=distance,
+        gt_positions=Q[:, :3, 3],
+        path_length=float(distance[-1]),
+        scores={metric.key: metric.measure(poses, config) for metric in METRICS},
+        time_offset=offset_ns / 1e9,
+        association=matches.recipe,
+        notes=notes,
+        faults=faults,
+        words=config.metrics,
+    )
+
+
+def _in_one_frame(
+    estimate: Trajectory,
+    ground_truth: Trajectory,
+    matches: Matches,
+    config: EvalConfig,
+    T_est_gt: Floats | None,
+    calibration: Calibration,
+) -> tuple[CommonFrame, list[str]]:
+    """Matched poses in the body frame `config.frame`, and notes about their unit of length."""
+    T_lidar_body = calibration.T_lidar(config.frame)
+    is_carried = config.frame != LIDAR_FRAME
+    truth, notes = matches.truth, []
     if T_est_gt is not None:
         truth = truth @ se3.inverse(T_est_gt)
         if ground_truth.frame == "cam0":
@@ -106,12 +142,13 @@ def evaluate(
         truth,
         (estimate.frame, ground_truth.frame),
         calibration.T_cam0_lidar,
-        is_given=T_est_gt is not None,
+        has_transform=T_est_gt is not None,
         wants_lidar=is_carried,
     )
     units = _other_unit(same.estimate, same.truth)
     # Whose body it is shows in motions, which are wrong then.
-    frames = [] if units else same.faults or _rotation_note(same.estimate, same.truth)
+    same.faults = [] if units else same.faults or _rotation_note(same.estimate, same.truth)
+    same.notes = notes + same.notes
     if is_carried:
         if estimate.frame == ground_truth.frame == "imu":
             T_lidar_body = se3.inverse(calibration.T_lidar("imu")) @ T_lidar_body
@@ -119,33 +156,22 @@ def evaluate(
         same.estimate = carry(same.estimate, T_lidar_body)
         same.truth = carry(same.truth, T_lidar_body, is_world_of_body)
         same.notes.append(f"poses of {config.frame}, {np.linalg.norm(T_lidar_body[:3, 3]):.3f} m from the sensor")
-    notes = [*units, *notes, *same.notes, *frames, *_nearly_straight(same.truth, config)]
-    faults = (*units, *frames)
-    for note in notes:
-        log.log(logging.WARNING if note in faults else logging.INFO, "%s: %s", estimate.source or "estimate", note)
-    found = _measure(same.estimate, same.truth, matches, config, (estimate, ground_truth), offset_ns / 1e9, notes)
-    return replace(found, faults=faults)
+    return same, units
 
 
-def _evaluate_positions(
-    estimate: Trajectory,
-    ground_truth: Trajectory,
-    matches: Matches,
-    config: EvalConfig,
-    T_est_gt: Floats | None,
-    time_offset: float,
-    notes: list[str],
-) -> Evaluation:
-    """Evaluation without rotations, for two trajectories of which one has positions alone.
+def _at_one_place(
+    estimate: Trajectory, ground_truth: Trajectory, matches: Matches, T_est_gt: Floats | None
+) -> tuple[CommonFrame, list[str]]:
+    """As `_in_one_frame`, for two trajectories of which one has positions alone.
 
     A prism or an antenna is off the LiDAR, so the trajectory with rotations is moved to its place by `T_est_gt`.
     """
     bare = [name for name, t in (("estimate", estimate), ("ground truth", ground_truth)) if not t.has_rotations]
     have = "have" if len(bare) == 2 else "has"
-    notes.append(
+    notes = [
         f"{' and '.join(bare)} {have} positions without rotations: ATE by positions is scored; rotation errors, origin "
         "alignment, RPE and KITTI drift are not available"
-    )
+    ]
     P, Q = matches.estimate, matches.truth
     if T_est_gt is not None and len(bare) == 2:
         raise InputError("--T-est-gt needs rotations of the estimate or of the ground truth: both have positions alone")
@@ -153,42 +179,7 @@ def _evaluate_positions(
         P, Q = (P @ T_est_gt, Q) if estimate.has_rotations else (P, Q @ se3.inverse(T_est_gt))
         other = "estimate" if estimate.has_rotations else "ground truth"
         notes.append(f"{other} carried to the place of the {bare[0]} by the transform given (T_est_gt)")
-    faults = _other_unit(P, Q)
-    notes = [*faults, *notes, *_nearly_straight(Q, config)]
-    for note in notes:
-        log.log(logging.WARNING if note in faults else logging.INFO, "%s: %s", estimate.source or "estimate", note)
-    pair = (estimate, ground_truth)
-    return replace(_measure(P, Q, matches, config, pair, time_offset, notes, False), faults=tuple(faults))
-
-
-def _measure(
-    P: Floats,
-    Q: Floats,
-    matches: Matches,
-    config: EvalConfig,
-    trajectories: tuple[Trajectory, Trajectory],
-    time_offset: float,
-    notes: list[str],
-    has_rotations: bool = True,
-) -> Evaluation:
-    """All metrics of matched poses in one body frame: P estimate, Q ground truth, (N, 4, 4)."""
-    distance = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(Q[:, :3, 3], axis=0), axis=1))])
-    poses = MatchedPoses(P, Q, matches.seconds, has_rotations)
-    return Evaluation(
-        estimate=trajectories[0].source or "estimate",
-        ground_truth=trajectories[1].source or "ground truth",
-        matched=len(P),
-        possible=matches.possible,
-        stamps_ns=matches.stamps_ns,
-        distance=distance,
-        gt_positions=Q[:, :3, 3],
-        path_length=float(distance[-1]),
-        scores={metric.key: metric.measure(poses, config) for metric in METRICS},
-        time_offset=time_offset,
-        association=matches.recipe,
-        notes=notes,
-        shown=config.metrics,
-    )
+    return CommonFrame(P, Q, notes), _other_unit(P, Q)
 
 
 def _other_unit(estimate: Floats, truth: Floats) -> list[str]:
@@ -207,7 +198,7 @@ def _other_unit(estimate: Floats, truth: Floats) -> list[str]:
 def _rotation_note(estimate: Floats, truth: Floats) -> list[str]:
     """Note when the motions show that the two body frames are rotated against each other, beyond what drift explains."""
     turn = body_turn(estimate, truth)
-    if turn is None or turn.squared < UNLIKELY:
+    if turn is None or turn.mahalanobis2 < UNLIKELY:
         return []
     rpy = ", ".join(f"{v:.1f}" for v in np.rad2deg(so3.euler_rpy(so3.exp(turn.rotation))))
     return [

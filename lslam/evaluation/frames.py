@@ -28,7 +28,7 @@ ROUNDS, SCALE = 30, 1.345
 
 
 @dataclass
-class Reconciled:
+class CommonFrame:
     """Both trajectories in one body frame, poses (N, 4, 4), with notes.
 
     notes : decisions and faults; faults : reasons why the two frames do not agree
@@ -54,23 +54,23 @@ def reconcile(
     truth: Floats,
     frames: tuple[str, str],
     T_cam0_lidar: Floats | None,
-    is_given: bool = False,
+    has_transform: bool = False,
     wants_lidar: bool = False,
-) -> Reconciled:
+) -> CommonFrame:
     """Bring matched poses (N, 4, 4) into one body frame.
 
     Parameters
     ----------
     frames : the frames the files state (estimate, ground truth); the motion outranks them where it is clear
     T_cam0_lidar : (4, 4) or None when unknown
-    is_given : the user stated the transform between the bodies: nothing is converted, a remaining difference is said
+    has_transform : the user stated the transform between the bodies: nothing is converted, a remaining difference is said
     wants_lidar : poses of the camera in both are converted to the LiDAR, where `T_cam0_lidar` is known
     """
     camera = [_is_camera(poses, frame) for poses, frame in zip((estimate, truth), frames, strict=True)]
-    out = Reconciled(estimate, truth)
-    if is_given:
-        explained = " (it is the pose of the truth's body in the estimate's body; the one given may be the inverse)"
-        _say_difference(out, "check", explained)
+    out = CommonFrame(estimate, truth)
+    if has_transform:
+        addition = " (it is the pose of the truth's body in the estimate's body; the one given may be the inverse)"
+        _say_difference(out, "check", addition)
         return out
     for who, frame, poses in (("estimate", frames[0], estimate), ("ground truth", frames[1], truth)):
         if frame == "cam0" and main_axis(poses) == "+x":
@@ -171,7 +171,7 @@ def _turns(poses: Floats, stride: int) -> Floats:
     return so3.log(np.swapaxes(R[:-1], -1, -2) @ R[1:])
 
 
-def _say_difference(out: Reconciled, way_out: str = "give", explained: str = "") -> None:
+def _say_difference(out: CommonFrame, way_out: str = "give", addition: str = "") -> None:
     """Add a fault if the motion shows that one body frame is rotated against the other."""
     R = body_rotation(out.estimate, out.truth)
     if R is None or np.rad2deg(so3.angle(R)) < SAME_DEG:
@@ -179,7 +179,7 @@ def _say_difference(out: Reconciled, way_out: str = "give", explained: str = "")
     rpy = ", ".join(f"{v:.0f}" for v in np.rad2deg(so3.euler_rpy(R)))
     out.faults.append(
         f"WRONG FRAMES: the ground truth's body is turned against the estimate's by about roll, pitch, yaw = {rpy} deg: "
-        f"{way_out} the transform between the bodies with --T-est-gt{explained}"
+        f"{way_out} the transform between the bodies with --T-est-gt{addition}"
     )
 
 
@@ -213,7 +213,7 @@ class BodyTurn:
         return float(np.sqrt(axis @ self.covariance @ axis))
 
     @property
-    def squared(self) -> float:
+    def mahalanobis2(self) -> float:
         """Squared Mahalanobis length of the rotation; without a rotation it is chi-square of three degrees of freedom."""
         return float(self.rotation @ np.linalg.solve(self.covariance, self.rotation))
 
@@ -256,12 +256,12 @@ def _pairs(truth: Floats) -> NDArray[np.intp]:
     steps = se3.relative(truth[:-1], truth[1:])
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(steps[:, :3, 3], axis=1))])
     turn = np.concatenate([[0.0], np.cumsum(so3.angle(steps[:, :3, :3]))])
-    found, first = [], 0
+    pairs, first = [], 0
     for k in range(1, len(truth)):
         if way[k] - way[first] >= LEAST_M or turn[k] - turn[first] >= LEAST_RAD:
-            found.append((first, k))
+            pairs.append((first, k))
             first = k
-    return np.array(found[:: 1 + len(found) // MOST], np.intp).reshape(-1, 2)
+    return np.array(pairs[:: 1 + len(pairs) // MOST], np.intp).reshape(-1, 2)
 
 
 def _linearise(A: Floats, B: Floats, R: Floats, t: Floats) -> tuple[Floats, Floats]:

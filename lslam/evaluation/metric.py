@@ -130,7 +130,7 @@ class Evaluation:
 
     matched, possible : pairs found, pairs at most; stamps_ns : (N,) of the matched poses, on the ground truth's clock
     distance : (N,) m travelled along the ground truth; gt_positions : (N, 3) m; path_length : m
-    scores : by key of the metric (`evaluation.evaluate`), each with its recipe; shown : words of `eval.metrics`
+    scores : by key of the metric (`evaluation.evaluate`), each with its recipe; words : words of `eval.metrics`
     time_offset : s added to the estimate's stamps; association : recipe sentence; notes : decisions and warnings
     faults : those of the notes that say what makes the numbers wrong
     odometry : the evaluation before the pose graph, for a run with one
@@ -149,7 +149,7 @@ class Evaluation:
     association: str
     notes: list[str]
     faults: tuple[str, ...] = ()
-    shown: tuple[str, ...] = ()
+    words: tuple[str, ...] = ()
     odometry: Evaluation | None = None
 
     @property
@@ -198,7 +198,7 @@ class TrajectoryMetric(ABC, Generic[Score]):
     key : of the score in `Evaluation.scores` and evaluation.json; name : for people
     word : in `eval.metrics`, which shows it; empty: it is always shown
     columns : fields of the score that are numbers, and how each is called and in which unit
-    gate_option : option of `lslam eval` that limits `gated`, without its dashes
+    gate_option : option of `lslam eval` that limits `gate_value`, without its dashes
     """
 
     key: str
@@ -251,20 +251,20 @@ class TrajectoryMetric(ABC, Generic[Score]):
         """Value, unit and name of headline numbers of the report."""
         return []
 
-    def gated(self, e: Evaluation) -> tuple[str, float | None, str]:
+    def gate_value(self, e: Evaluation) -> tuple[str, float | None, str]:
         """Name, value and unit that `gate_option` limits, by default the first column; None when it is not available."""
         field, metric = self.columns[0]
         value = float(getattr(self.of(e), field))
         return self.name, None if np.isnan(value) else value, metric.unit
 
-    def compared(self, configs: Sequence[EvalConfig]) -> list[Metric]:
+    def comparison_metrics(self, configs: Sequence[EvalConfig]) -> list[Metric]:
         """Numbers that comparisons and studies read."""
         return [metric for _, metric in self.columns]
 
     def values(self, document: Any) -> dict[str, float]:
         """Numbers by key, from the metric's part of evaluation.json; null values are left out."""
-        found = {metric.key: document[field] for field, metric in self.columns}
-        return {key: value for key, value in found.items() if value is not None}
+        numbers = {metric.key: document[field] for field, metric in self.columns}
+        return {key: value for key, value in numbers.items() if value is not None}
 
     def _texts(self, e: Evaluation) -> list[tuple[Metric, str]]:
         score = self.of(e)
@@ -286,6 +286,6 @@ def two(values: object, a: str, b: str) -> str:
     return "n/a" if values is None else f"{significant(getattr(values, a))} / {significant(getattr(values, b))}"
 
 
-def cells_of(errors: Sequence[Any], is_known: Callable[[Any], bool], pick: Callable[[Any], str]) -> list[str]:
+def cells_of(errors: Sequence[Any], has_value: Callable[[Any], bool], pick: Callable[[Any], str]) -> list[str]:
     """Texts of errors; the note of one that is not available."""
-    return [pick(error) if is_known(error) else error.note for error in errors]
+    return [pick(error) if has_value(error) else error.note for error in errors]

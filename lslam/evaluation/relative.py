@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -68,12 +69,12 @@ def by_time(seconds: Floats, delta: float, all_pairs: bool) -> Pairs:
     if all_pairs:
         return every
     end_of = dict(every.tolist())
-    chain, i = [], 0
+    pairs, i = [], 0
     while i < len(seconds):
         if i in end_of:
-            chain.append((i, end_of[i]))
+            pairs.append((i, end_of[i]))
         i = end_of.get(i, i + 1)
-    return np.array(chain, np.int64).reshape(-1, 2)
+    return np.array(pairs, np.int64).reshape(-1, 2)
 
 
 def _nearest(along: Floats, delta: float) -> Pairs:
@@ -177,26 +178,19 @@ class RelativePoseError(TrajectoryMetric[list[RelativeError]]):
             t, r = error.translation, error.rotation_deg
             values = (metres(t.rmse), metres(t.mean), metres(t.max), f"{r.rmse:.4f}", f"{r.mean:.4f}", f"{r.max:.4f}")
             rows.append((error.name, str(error.n_pairs), *values))
-        header = (
-            "pair rule",
-            "pairs",
-            "translation rmse, m",
-            "mean, m",
-            "max, m",
-            "rotation rmse, deg",
-            "mean, deg",
-            "max, deg",
-        )
+        errors = (("translation", "m"), ("rotation", "deg"))
+        columns = ((f"{what} rmse, {unit}", f"mean, {unit}", f"max, {unit}") for what, unit in errors)
+        header = ("pair rule", "pairs", *chain.from_iterable(columns))
         recipe = (
             "E = inv(inv(Q_i) Q_j) (inv(P_i) P_j) over the pairs of the rule; P estimate, Q ground truth; no alignment."
         )
         return [Table("Relative pose error (RPE)", header, tuple(rows), recipe)]
 
-    def gated(self, e: Evaluation) -> tuple[str, float | None, str]:
+    def gate_value(self, e: Evaluation) -> tuple[str, float | None, str]:
         first = self.of(e)[0]
         return f"RPE {first.name} rmse", first.translation.rmse if first.translation else None, "m"
 
-    def compared(self, configs: Sequence[EvalConfig]) -> list[Metric]:
+    def comparison_metrics(self, configs: Sequence[EvalConfig]) -> list[Metric]:
         deltas = list(dict.fromkeys(parse_delta(text) for config in configs for text in config.delta))
         metrics = []
         for delta, unit, pairs in deltas:

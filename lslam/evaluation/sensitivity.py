@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from lslam.core.config.study import ExpectedFinding
-from lslam.core.types.arrays import Floats
+from lslam.core.types.arrays import Bools, Floats
 from lslam.core.types.study import (
     Curve,
     CurveResult,
@@ -20,8 +20,10 @@ from lslam.core.types.study import (
     StudyResult,
     StudyRow,
 )
+from lslam.evaluation import verdicts
 from lslam.evaluation.curves import (
     FEWEST,
+    contrast,
     curves_of,
     divergence,
     fit_law,
@@ -30,41 +32,90 @@ from lslam.evaluation.curves import (
     median_over_seeds,
     optimum,
     over_seeds,
-)
-from lslam.evaluation.trends import OF_IMU, judge_imu, judge_trend
-from lslam.evaluation.verdicts import (
-    judge_acts_only_on,
-    judge_best_between,
-    judge_diverges_beyond,
-    judge_elbow_at,
-    judge_good_from,
-    judge_holds_up_to,
-    judge_largest_between,
-    judge_law,
-    judge_matters_little,
-    judge_product,
+    valid_runs,
 )
 
 _OF_TIME = ("time_per_scan", "total_time")
 _LAWS = ("linear", "inverse", "product")
 _OF_ERROR = ("diverges_beyond", "holds_up_to", "elbow_at", "good_from")
 _OF_WORDS = ("matters_little", "acts_only_on")
+SKIP = "input.skip_frames"
+EFFICIENCIES = ("efficiency", "total_efficiency")
+# Sign that the change is expected to have.
+OF_IMU = {"imu_lowers": -1.0, "imu_flattens": -1.0, "imu_steepens": 1.0}
+
+
+def judge_trend(finding: ExpectedFinding, result: CurveResult) -> Judged:
+    """Verdict on a rise or fall: of each seed, the median over the upper half of the values against that over the lower half.
+
+    Confirmed if larger, or smaller, by a tenth and by more than the scatter over seeds; refuted if it is no more than that.
+    """
+    table = valid_runs(result.curve, finding.of)
+    half = len(table) // 2
+    if np.isfinite(table).any(1).sum() < verdicts.FEWEST_VALUES:
+        return "undecided", f"fewer than {verdicts.FEWEST_VALUES} values have a result"
+    lower, upper = (median_over_seeds(part.T) for part in (table[:half], table[-half:]))
+    first, second = (upper, lower) if finding.kind == "rises" else (lower, upper)
+    ratio = contrast(first, second)
+    said = f"{finding.of.replace('_', ' ')} of the upper half of the values is {_ratio(upper, lower)} times that of the lower"
+    if ratio.is_more:
+        return "confirmed", said
+    return ("refuted" if ratio.is_no_more else "undecided"), said
+
+
+def judge_imu(finding: ExpectedFinding, result: CurveResult, others: Sequence[CurveResult]) -> Judged:
+    """Verdict on a run with the IMU against the same without: level or slope, seed by seed, over values that both have.
+
+    Confirmed if the difference is of the expected sign by more than the scatter over seeds; refuted if of the other.
+    """
+    curve = result.curve
+    same = [o for o in others if (o.curve.method, o.curve.at, o.curve.uses_imu) == (curve.method, curve.at, False)]
+    if not same or not np.array_equal(same[0].curve.values, curve.values) or same[0].curve.seeds != curve.seeds:
+        return "undecided", "the same was not run without the IMU"
+    with_imu, without = (valid_runs(each.curve, finding.of) for each in (result, same[0]))
+    mask = np.isfinite(with_imu) & np.isfinite(without) & (with_imu > 0) & (without > 0)
+    seeds = np.flatnonzero(mask.sum(0) >= verdicts.FEWEST_VALUES)
+    name = finding.of.replace("_", " ")
+    if len(seeds) < 2:
+        return "undecided", f"{name}: fewer than 2 seeds have {verdicts.FEWEST_VALUES} values with and without the IMU"
+    if finding.kind == "imu_lowers":
+        ratios = [float(np.median(with_imu[mask[:, s], s] / without[mask[:, s], s])) for s in seeds]
+        changes, said = np.log(ratios), f"{name} with the IMU is {np.median(ratios):.2f} times that without"
+    else:
+        slopes = np.array([[_slope(curve.values, t[:, s], mask[:, s]) for t in (with_imu, without)] for s in seeds])
+        changes = slopes[:, 0] - slopes[:, 1]
+        middle = np.median(slopes, axis=0)
+        said = f"{name} goes by {middle[0]:.3g} with and {middle[1]:.3g} without the IMU for each unit"
+    signed = OF_IMU[finding.kind] * changes
+    mean, std = float(signed.mean()), float(signed.std(ddof=1))
+    if mean - std > 0:
+        return "confirmed", said
+    return ("refuted", said) if mean + std < 0 else ("undecided", f"{said}, by less than the seeds scatter")
+
+
+def _ratio(upper: Floats, lower: Floats) -> str:
+    mask = np.isfinite(upper) & np.isfinite(lower) & (lower > 0)
+    return f"{np.median(upper[mask] / lower[mask]):.2f}" if mask.any() else "unknown"
+
+
+def _slope(values: Floats, numbers: Floats, mask: Bools) -> float:
+    return float(np.polyfit(values[mask], numbers[mask], 1)[0])
+
+
 _JUDGES: dict[str, Callable[[ExpectedFinding, CurveResult], Judged]] = {
-    "diverges_beyond": judge_diverges_beyond,
-    "holds_up_to": judge_holds_up_to,
-    "best_between": judge_best_between,
-    "largest_between": judge_largest_between,
-    "elbow_at": judge_elbow_at,
-    "good_from": judge_good_from,
-    "matters_little": judge_matters_little,
-    "linear": judge_law,
-    "inverse": judge_law,
-    "acts_only_on": judge_acts_only_on,
+    "diverges_beyond": verdicts.judge_diverges_beyond,
+    "holds_up_to": verdicts.judge_holds_up_to,
+    "best_between": verdicts.judge_best_between,
+    "largest_between": verdicts.judge_largest_between,
+    "elbow_at": verdicts.judge_elbow_at,
+    "good_from": verdicts.judge_good_from,
+    "matters_little": verdicts.judge_matters_little,
+    "linear": verdicts.judge_law,
+    "inverse": verdicts.judge_law,
+    "acts_only_on": verdicts.judge_acts_only_on,
     "rises": judge_trend,
     "falls": judge_trend,
 }
-SKIP = "input.skip_frames"
-EFFICIENCIES = ("efficiency", "total_efficiency")
 
 
 def judge(finding: ExpectedFinding, results: Sequence[CurveResult], products: Mapping[str, Law]) -> FindingVerdict:
@@ -79,7 +130,8 @@ def judge(finding: ExpectedFinding, results: Sequence[CurveResult], products: Ma
         return FindingVerdict(finding.text, "undecided", "no run of that kind came to an end", finding.source)
     if finding.kind == "product":
         judged = {
-            result.curve.series: judge_product(finding, products.get(result.curve.series), result) for result in mine
+            result.curve.series: verdicts.judge_product(finding, products.get(result.curve.series), result)
+            for result in mine
         }
     else:
         judged = {result.curve.label: _judge_one(finding, result, results) for result in mine}
@@ -162,8 +214,7 @@ def _evaluate(rows: Sequence[StudyRow], beside: Sequence[StudyRow], findings: Se
 
 def _result(curve: Curve) -> CurveResult:
     tables = {
-        name: table if name in EFFICIENCIES else np.where(curve.losses, np.nan, table)
-        for name, table in curve.quantities.items()
+        name: table if name in EFFICIENCIES else valid_runs(curve, name) for name, table in curve.quantities.items()
     }
     means = {name: over_seeds(table) for name, table in tables.items()}
     medians = {name: median_over_seeds(table) for name, table in tables.items()}

@@ -117,11 +117,13 @@ def _linearise(
     return change, max(sigma, information**-0.5 * 0.1), coherence
 
 
-def _covers(known: Stamps, stamps: Stamps) -> Bools:
+def _covers(truth_ns: Stamps, stamps: Stamps) -> Bools:
     """(N,) whether stamps lie within the truth's time range and in no gap of it."""
-    after = np.clip(np.searchsorted(known, stamps, side="left"), 1, len(known) - 1)
-    gaps = known[after] - known[after - 1]
-    return np.asarray((stamps >= known[0]) & (stamps <= known[-1]) & (gaps <= HOLES * np.median(np.diff(known))))
+    after = np.clip(np.searchsorted(truth_ns, stamps, side="left"), 1, len(truth_ns) - 1)
+    gaps = truth_ns[after] - truth_ns[after - 1]
+    return np.asarray(
+        (stamps >= truth_ns[0]) & (stamps <= truth_ns[-1]) & (gaps <= HOLES * np.median(np.diff(truth_ns)))
+    )
 
 
 def _motions(poses: Floats, count: int, turns: bool) -> Floats:

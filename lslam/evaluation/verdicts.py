@@ -25,6 +25,7 @@ from lslam.evaluation.curves import (
     rise_at,
     rise_below,
     rival,
+    valid_runs,
 )
 
 R2 = 0.95
@@ -45,7 +46,7 @@ def judge_matters_little(finding: ExpectedFinding, result: CurveResult) -> Judge
     known = np.isfinite(medians) & (medians > 0)
     if known.sum() < FEWEST_VALUES:
         return "undecided", f"fewer than {FEWEST_VALUES} values have a result"
-    table = np.where(curve.losses, np.nan, curve.quantities[finding.of])
+    table = valid_runs(curve, finding.of)
     top, bottom = (int(pick(np.where(known, medians, np.nan))) for pick in (np.nanargmax, np.nanargmin))
     largest, smallest = medians[top], medians[bottom]
     name, unit = finding.of.replace("_", " "), UNITS.get(finding.of, "")
@@ -198,41 +199,41 @@ def _as_most_seeds(says: Callable[[Curve], Judged], curve: Curve) -> Judged:
     return "undecided", f"{said}, but so in {agree} of {len(scored)} seeds only"
 
 
-def _diverges_beyond(curve: Curve, expected: float) -> Judged:
-    values, found = _scored_values(curve), divergence(curve)
-    if found.first_bad is not None and found.last_good is None:
-        outcome: Outcome = "undecided" if expected < values[0] else "refuted"
-        return outcome, f"everything diverges, from {found.first_bad:g} on"
-    last = float(values[-1]) if found.last_good is None else found.last_good
-    lost = _lost(curve, last)
+def _diverges_beyond(curve: Curve, target: float) -> Judged:
+    values, divergent = _scored_values(curve), divergence(curve)
+    if divergent.first_bad is not None and divergent.last_good is None:
+        outcome: Outcome = "undecided" if target < values[0] else "refuted"
+        return outcome, f"everything diverges, from {divergent.first_bad:g} on"
+    last = float(values[-1]) if divergent.last_good is None else divergent.last_good
+    lost = _loss_remark(curve, last)
     place = int(np.flatnonzero(values == last)[0])
     # Luck of a few runs moves a divergence by a step.
-    is_near = values[max(place - 1, 0)] <= expected <= values[min(place + 1, len(values) - 1)]
-    if found.first_bad is None:
+    is_near = values[max(place - 1, 0)] <= target <= values[min(place + 1, len(values) - 1)]
+    if divergent.first_bad is None:
         said = f"{'it holds' if lost else 'nothing diverges'} up to {last:g}, the largest value{lost}"
-        return "undecided" if is_near or expected > last else "refuted", said
+        return "undecided" if is_near or target > last else "refuted", said
     said = f"{last:g} is the last value that works{lost}"
-    if last <= expected < found.first_bad:
-        return "undecided" if found.alone else "confirmed", said
+    if last <= target < divergent.first_bad:
+        return "undecided" if divergent.alone else "confirmed", said
     return "undecided" if is_near else "refuted", said
 
 
-def _holds_up_to(curve: Curve, expected: float) -> Judged:
-    values, found = _scored_values(curve), divergence(curve)
-    if found.first_bad is not None and found.first_bad <= expected:
-        below = -np.inf if found.last_good is None else found.last_good
-        return "refuted", f"it diverges from {found.first_bad:g} on{_lost(curve, below)}"
-    last = values[-1] if found.first_bad is None else found.last_good
-    if values[-1] < expected:
+def _holds_up_to(curve: Curve, target: float) -> Judged:
+    values, divergent = _scored_values(curve), divergence(curve)
+    if divergent.first_bad is not None and divergent.first_bad <= target:
+        below = -np.inf if divergent.last_good is None else divergent.last_good
+        return "refuted", f"it diverges from {divergent.first_bad:g} on{_loss_remark(curve, below)}"
+    last = values[-1] if divergent.first_bad is None else divergent.last_good
+    if values[-1] < target:
         return "undecided", f"{values[-1]:g} is the largest value that was run"
-    if values[0] > expected or last is None:
+    if values[0] > target or last is None:
         return "undecided", f"{values[0]:g} is the smallest value that was run"
-    if last < expected:
-        return "undecided", f"{last:g} works, {found.first_bad:g} does not, and nothing was run between"
-    lost = _lost(curve, expected)
-    if any(value <= expected for value in found.alone):
+    if last < target:
+        return "undecided", f"{last:g} works, {divergent.first_bad:g} does not, and nothing was run between"
+    lost = _loss_remark(curve, target)
+    if any(value <= target for value in divergent.alone):
         return "undecided", f"nothing diverges for good{lost}"
-    return "confirmed", f"{'it holds' if lost else 'nothing diverges'} up to {expected:g}{lost}"
+    return "confirmed", f"{'it holds' if lost else 'nothing diverges'} up to {target:g}{lost}"
 
 
 def judge_best_between(finding: ExpectedFinding, result: CurveResult) -> Judged:
@@ -298,7 +299,7 @@ def _ranking(finding: ExpectedFinding, curve: Curve, other: int, base: int, is_h
             return "worse"
         # Of lost runs the errors are the largest there are; their times say nothing.
         return "better" if finding.of in ("translation", "angular") else "unknown"
-    table = np.where(curve.losses, np.nan, curve.quantities[finding.of])
+    table = valid_runs(curve, finding.of)
     ours, theirs = (table[base], table[other]) if is_highest else (table[other], table[base])
     lead, lag = contrast(ours, theirs), contrast(theirs, ours)
     if lead.is_more:
@@ -310,9 +311,9 @@ def _ranking(finding: ExpectedFinding, curve: Curve, other: int, base: int, is_h
 
 def _best_by_seed(finding: ExpectedFinding, result: CurveResult, is_highest: bool) -> list[Optimum]:
     """Best value of each seed alone, for seeds that have any result."""
-    table = np.where(result.curve.losses, np.nan, result.curve.quantities[finding.of])
-    found = [optimum(result.curve.values, column, is_highest_best=is_highest) for column in table.T]
-    return [best for best in found if best is not None]
+    table = valid_runs(result.curve, finding.of)
+    optima = [optimum(result.curve.values, column, is_highest_best=is_highest) for column in table.T]
+    return [best for best in optima if best is not None]
 
 
 def judge_elbow_at(finding: ExpectedFinding, result: CurveResult) -> Judged:
@@ -320,47 +321,53 @@ def judge_elbow_at(finding: ExpectedFinding, result: CurveResult) -> Judged:
 
     Undecided one value beside it; refuted if it reaches the plateau later, or is as good just below.
     """
-    curve, expected = result.curve, finding.values[0]
+    curve, target = result.curve, finding.values[0]
     values = _scored_values(curve)
-    if not values[0] <= expected <= values[-1]:
+    if not values[0] <= target <= values[-1]:
         return "undecided", f"values from {values[0]:g} to {values[-1]:g} were run"
-    found = _elbow(result)
-    place = int(np.searchsorted(values, expected))
-    if found is None or _place(values, found) > place + 1:
-        return _plateau_is_later(result, expected, found)
-    if found == values[0]:
-        said = f"there is no elbow: {found:g}, the smallest value, is as good as the others"
+    plateau_start = _elbow(result)
+    place = int(np.searchsorted(values, target))
+    if plateau_start is None or _place(values, plateau_start) > place + 1:
+        return _plateau_is_later(result, target, plateau_start)
+    if plateau_start == values[0]:
+        said = f"there is no elbow: {plateau_start:g}, the smallest value, is as good as the others"
         return _only_if_as_good(_rise_before(curve, values, place)), said
-    said = f"the error is on its plateau from {found:g} on"
-    rise = _rise_before(curve, values, _place(values, found))
-    if found == values[place]:
+    said = f"the error is on its plateau from {plateau_start:g} on"
+    rise = _rise_before(curve, values, _place(values, plateau_start))
+    if plateau_start == values[place]:
         return "confirmed" if rise == "worse" else "undecided", f"{said}; below {BELOW[rise]}"
-    if abs(_place(values, found) - place) == 1:
-        return "undecided", f"{said}, one value beside {expected:g}"
+    if abs(_place(values, plateau_start) - place) == 1:
+        return "undecided", f"{said}, one value beside {target:g}"
     return _only_if_as_good(_rise_before(curve, values, place)), said
 
 
 def judge_good_from(finding: ExpectedFinding, result: CurveResult) -> Judged:
     """Verdict: confirmed if the error is on its plateau there and some value below is worse, refuted if these are as good."""
-    curve, expected = result.curve, finding.values[0]
+    curve, target = result.curve, finding.values[0]
     values = _scored_values(curve)
-    if not values[0] <= expected <= values[-1]:
+    if not values[0] <= target <= values[-1]:
         return "undecided", f"values from {values[0]:g} to {values[-1]:g} were run"
-    found = _elbow(result)
-    if found is None or found > expected:
-        return _plateau_is_later(result, expected, found)
-    below = rise_below(curve, expected)
+    plateau_start = _elbow(result)
+    if plateau_start is None or plateau_start > target:
+        return _plateau_is_later(result, target, plateau_start)
+    below = rise_below(curve, target)
     outcomes: dict[Rise, Outcome] = {"worse": "confirmed", "as good": "refuted", "unknown": "undecided"}
-    return outcomes[below], f"the error is on its plateau from {expected:g} on; below {expected:g} {BELOW[below]}"
+    return outcomes[below], f"the error is on its plateau from {target:g} on; below {target:g} {BELOW[below]}"
 
 
-def _plateau_is_later(result: CurveResult, expected: float, found: float | None) -> Judged:
+def _plateau_is_later(result: CurveResult, target: float, plateau_start: float | None) -> Judged:
     """Refuted if a value from the expected one to the plateau is worse by more than the scatter over seeds, else undecided."""
     curve = result.curve
     values = _scored_values(curve)
     level = plateau(curve, float(values[len(values) // 2]))
-    said = "the error comes to no plateau" if found is None else f"the error is on its plateau from {found:g} on"
-    before = np.flatnonzero((curve.values >= expected) & (curve.values < (np.inf if found is None else found)))
+    said = (
+        "the error comes to no plateau"
+        if plateau_start is None
+        else f"the error is on its plateau from {plateau_start:g} on"
+    )
+    before = np.flatnonzero(
+        (curve.values >= target) & (curve.values < (np.inf if plateau_start is None else plateau_start))
+    )
     if any(rise_at(curve, int(index), level) == "worse" for index in before):
         return "refuted", said
     return "undecided", f"{said}, but before it no error is worse by more than the seeds scatter"
@@ -391,7 +398,7 @@ def _place(values: Floats, value: float) -> int:
     return int(np.flatnonzero(values == value)[0])
 
 
-def _lost(curve: Curve, last: float) -> str:
+def _loss_remark(curve: Curve, last: float) -> str:
     """Remark on the number of lost runs at values up to `last`, which work for most seeds; empty if none is lost."""
     at = curve.losses.any(1) & (curve.values <= last)
     lost, ran = int(curve.losses[at].sum()), int(curve.with_score[at].sum())

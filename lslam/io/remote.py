@@ -118,9 +118,9 @@ class RemotePath(PosixPath):
     def files(self) -> Iterator[tuple[str, os.stat_result]]:
         """Relative name and `stat` of every object below, sorted by name, with one request per thousand objects."""
         with _asking(self, "listed") as (system, place):
-            found = system.find(place, detail=True)
-        for name in sorted(found):
-            yield name.strip("/").removeprefix(place.strip("/")).lstrip("/"), _stat(found[name])
+            entries = system.find(place, detail=True)
+        for name in sorted(entries):
+            yield name.strip("/").removeprefix(place.strip("/")).lstrip("/"), _stat(entries[name])
 
     def read_bytes(self) -> bytes:
         """Whole content of the object."""
@@ -152,8 +152,8 @@ class RemotePath(PosixPath):
             if len(ranges) == 1:
                 return [bytes(system.cat_file(place, start=ranges[0][0], end=ranges[0][1]))]
             begins, ends = zip(*ranges, strict=True)
-            found = system.cat_ranges([place] * len(ranges), list(begins), list(ends), on_error="raise")
-            return [bytes(data) for data in found]
+            parts = system.cat_ranges([place] * len(ranges), list(begins), list(ends), on_error="raise")
+            return [bytes(data) for data in parts]
 
     def mkdir(self, mode: int = 0o777, parents: bool = False, exist_ok: bool = False) -> None:
         """Do nothing: folders of storage are prefixes of names."""

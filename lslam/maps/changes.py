@@ -98,7 +98,7 @@ class ChangedCells:
 class _Drive:
     """Cell keys of one drive by state; each array is sorted.
 
-    seen : all; occupied : in the end, and in the sum; certain : those of them beyond doubt; free : beyond doubt; blocked : in
+    seen : all; occupied : in the end, and in the sum; certain : those of them beyond doubt; free : beyond doubt; solid : in
         the end or in the sum
     """
 
@@ -106,7 +106,7 @@ class _Drive:
     occupied: Keys
     certain: Keys
     free: Keys
-    blocked: Keys
+    solid: Keys
 
 
 def changed_cells(new: Evidence, old: Evidence) -> ChangedCells:
@@ -129,7 +129,7 @@ def changed_cells(new: Evidence, old: Evidence) -> ChangedCells:
         *_things("appeared", after, before, new),
         *_things("vanished", before, after, new),
     ]
-    same = after.occupied[_beside(after.occupied, before.blocked)]
+    same = after.occupied[_beside(after.occupied, before.solid)]
     return ChangedCells(
         tuple(changes),
         _cells(same, new),
@@ -141,20 +141,20 @@ def changed_cells(new: Evidence, old: Evidence) -> ChangedCells:
     )
 
 
-def differences(found: Evidence, cloud: Floats) -> tuple[MapChange, ...]:
+def differences(evidence: Evidence, cloud: Floats) -> tuple[MapChange, ...]:
     """Objects by which a drive differs from a finished map (N, 3), m, in the world of the drive.
 
     A map tells where surfaces are, not where nothing is. So what `vanished` stood where beams of the drive passed and none
     ended, and what `appeared` is new, or was hidden when the map was made; only squares in which the map has points count.
     """
-    cells = np.floor(cloud / found.voxel).astype(np.int64)
-    known, none = np.unique(_keys(cells, found.origin)), np.zeros(0, np.int64)
-    drive = _drive(found)
-    drive = replace(drive, blocked=found.keys[found.was_hit])
-    gone = _things("vanished", _Drive(known, known, known, none, known), drive, found)
+    cells = np.floor(cloud / evidence.voxel).astype(np.int64)
+    known, none = np.unique(_keys(cells, evidence.origin)), np.zeros(0, np.int64)
+    drive = _drive(evidence)
+    drive = replace(drive, solid=evidence.keys[evidence.has_hits])
+    gone = _things("vanished", _Drive(known, known, known, none, known), drive, evidence)
     new = drive.occupied[~_beside(drive.occupied, known)]
-    new = new[np.isin(_squares(_cells(new, found)), np.unique(_squares(cells)))]
-    return (*_objects("appeared", new, _among(new, drive.certain), found), *gone)
+    new = new[np.isin(_squares(_cells(new, evidence)), np.unique(_squares(cells)))]
+    return (*_objects("appeared", new, _among(new, drive.certain), evidence), *gone)
 
 
 def _squares(cells: Longs) -> Longs:
@@ -163,18 +163,18 @@ def _squares(cells: Longs) -> Longs:
     return np.asarray((x << 32) + y)
 
 
-def points_in(cloud: Floats, changes: Iterable[MapChange], found: Evidence) -> Bools:
+def points_in(cloud: Floats, changes: Iterable[MapChange], evidence: Evidence) -> Bools:
     """(N,) which points (N, 3), m, lie in cells of the changes."""
     parts = [change.cells for change in changes]
     if not parts:
         return np.zeros(len(cloud), np.bool_)
-    cells = np.floor(cloud / found.voxel).astype(np.int64)
-    return _among(_keys(cells, found.origin), np.sort(_keys(np.concatenate(parts), found.origin)))
+    cells = np.floor(cloud / evidence.voxel).astype(np.int64)
+    return _among(_keys(cells, evidence.origin), np.sort(_keys(np.concatenate(parts), evidence.origin)))
 
 
 def _keys(cells: Longs, origin: Longs) -> Keys:
     """Key of each cell (M, 3), -1 beyond the range of keys."""
-    from lslam.maps.kernels.voxel_average import AXIS_BITS, HALF
+    from lslam.maps.kernels.cells import AXIS_BITS, HALF
 
     places = cells - origin + HALF
     is_inside = ((places >= 0) & (places < 2 * HALF)).all(axis=1)
@@ -182,27 +182,27 @@ def _keys(cells: Longs, origin: Longs) -> Keys:
     return np.where(is_inside, (x << 2 * AXIS_BITS) | (y << AXIS_BITS) | z, -1)
 
 
-def _drive(found: Evidence) -> _Drive:
+def _drive(evidence: Evidence) -> _Drive:
     lowest, highest = int(MODEL[2]), int(MODEL[3])
-    in_the_end, in_the_sum = found.log_odds, found.sums
+    in_the_end, in_the_sum = evidence.log_odds, evidence.sums
     return _Drive(
-        found.keys,
-        found.keys[(in_the_end > 0) & (in_the_sum > 0)],
-        found.keys[(in_the_end >= highest) & (in_the_sum >= highest)],
-        found.keys[(in_the_end <= lowest) & (in_the_sum <= lowest)],
-        found.keys[(in_the_end > 0) | (in_the_sum > 0)],
+        evidence.keys,
+        evidence.keys[(in_the_end > 0) & (in_the_sum > 0)],
+        evidence.keys[(in_the_end >= highest) & (in_the_sum >= highest)],
+        evidence.keys[(in_the_end <= lowest) & (in_the_sum <= lowest)],
+        evidence.keys[(in_the_end > 0) | (in_the_sum > 0)],
     )
 
 
-def _things(kind: Kind, here: _Drive, there: _Drive, found: Evidence) -> list[MapChange]:
+def _things(kind: Kind, here: _Drive, there: _Drive, evidence: Evidence) -> list[MapChange]:
     """Connected cells that are occupied here and free there, as objects, the largest first."""
     passed = here.occupied[_among(here.occupied, there.free)]
-    alone = passed[~_beside(passed, there.blocked) & _open(passed, there.seen)]
+    alone = passed[~_beside(passed, there.solid) & _open(passed, there.seen)]
     cells = passed[_beside(passed, alone)]
-    return _objects(kind, cells, _among(cells, here.certain) & _among(cells, alone), found)
+    return _objects(kind, cells, _among(cells, here.certain) & _among(cells, alone), evidence)
 
 
-def _objects(kind: Kind, cells: Keys, certain: Bools, found: Evidence) -> list[MapChange]:
+def _objects(kind: Kind, cells: Keys, certain: Bools, evidence: Evidence) -> list[MapChange]:
     """Connected cells, of which at least one is `certain`, and more of them than noise makes; the largest first."""
     if not len(cells):
         return []
@@ -211,7 +211,7 @@ def _objects(kind: Kind, cells: Keys, certain: Bools, found: Evidence) -> list[M
     is_certain = np.bincount(labels, certain) > 0
     kept = np.flatnonzero((sizes > NOISE_CELLS) & is_certain)
     kept = kept[np.argsort(-sizes[kept], kind="stable")]
-    return [MapChange(kind, _cells(cells[labels == label], found), found.voxel) for label in kept]
+    return [MapChange(kind, _cells(cells[labels == label], evidence), evidence.voxel) for label in kept]
 
 
 def _components(keys: Keys) -> Longs:
@@ -246,7 +246,7 @@ def _open(keys: Keys, seen: Keys) -> Bools:
 
 def _steps() -> list[int]:
     """Differences of keys to the 27 cells around one, sorted; the cell itself is in the middle."""
-    from lslam.maps.kernels.voxel_average import AXIS_BITS
+    from lslam.maps.kernels.cells import AXIS_BITS
 
     return [(x << 2 * AXIS_BITS) + (y << AXIS_BITS) + z for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)]
 
@@ -263,7 +263,7 @@ def _indices_of(keys: Keys, others: Keys) -> Longs:
     return np.where(others[at] == keys, at, -1)
 
 
-def _cells(keys: Keys, found: Evidence) -> Longs:
-    from lslam.maps.kernels.voxel_average import unpack_cells
+def _cells(keys: Keys, evidence: Evidence) -> Longs:
+    from lslam.maps.kernels.cells import unpack_cells
 
-    return unpack_cells(keys, found.origin)
+    return unpack_cells(keys, evidence.origin)

@@ -75,28 +75,28 @@ def standing(points: NDArray[np.float32], sensor: Floats, floors: Iterable[Floor
     return stands
 
 
-def things_of(points: NDArray[np.float32], chosen: Bools) -> Longs:
-    """Object number of each of the `chosen` points (N, 3), from 1, by connected squares; 0 for the others.
+def things_of(points: NDArray[np.float32], subset: Bools) -> Longs:
+    """Object number of each of the `subset` points (N, 3), from 1, by connected squares; 0 for the others.
 
-    points : as for `floor_of`; chosen : (N,), within reach
+    points : as for `floor_of`; subset : (N,), within reach
     """
     from scipy import ndimage
 
     labels = np.zeros(len(points), np.int64)
-    x, y = np.floor((points[chosen, :2] + REACH_M) / GAP).astype(np.int64).T
+    x, y = np.floor((points[subset, :2] + REACH_M) / GAP).astype(np.int64).T
     taken = np.zeros((int(2 * REACH_M / GAP) + 1,) * 2, np.bool_)
     taken[x, y] = True
     numbered, _ = ndimage.label(taken, np.ones((3, 3)))
-    labels[chosen] = numbered[x, y]
+    labels[subset] = numbered[x, y]
     return labels
 
 
 def whole(moves: Bools, labels: Longs, share: float, least: int) -> Bools:
     """Mask (N,) extended to all points of objects of which at least the share `share` and `least` points are masked."""
     total, moving = np.bincount(labels), np.bincount(labels, moves)
-    chosen = (moving >= least) & (moving >= share * total)
-    chosen[:1] = False  # 0 is no thing
-    return np.asarray(moves | chosen[labels])
+    subset = (moving >= least) & (moving >= share * total)
+    subset[:1] = False  # 0 is no thing
+    return np.asarray(moves | subset[labels])
 
 
 def _squares(near: NDArray[np.float32], sensor: Floats) -> tuple[Longs, Longs]:
@@ -197,7 +197,7 @@ class Cleaner:
 
     def add(self, scan: PosedScan) -> list[PosedScan]:
         """Add a scan. Returns the scans that can be decided now."""
-        from lslam.maps.kernels.see_through import nearest_ranges
+        from lslam.maps.kernels.views import nearest_ranges
 
         points = np.ascontiguousarray(scan.points, np.float32)
         scan = replace(scan, points=points)
@@ -256,7 +256,7 @@ class Cleaner:
         stands = standing(upright, sensor, floors)
         points, upright = scan.points[stands], upright[stands]
         free, hit = self._votes(points, scan.T_world_lidar, others)
-        moving = spread((free >= 1) & (free >= hit), points)
+        moving = extend_to_cubes((free >= 1) & (free >= hit), points)
         # Somebody beside a wall is a thing once the wall, which others saw, is left aside; then the feet join.
         moving = whole(moving, things_of(upright, moving | (free >= hit)), MOST_LEFT, LEAST_LEFT)
         moving = whole(moving, things_of(upright, np.ones(len(points), np.bool_)), MOST, LEAST)
@@ -277,7 +277,7 @@ class Cleaner:
 
         Counting of a point ends as soon as the majority for a surface is certain.
         """
-        from lslam.maps.kernels.see_through import vote
+        from lslam.maps.kernels.views import vote
 
         free, hit = np.zeros(len(points), np.int16), np.zeros(len(points), np.int16)
         if self._grid is not None:
@@ -288,7 +288,7 @@ class Cleaner:
         return free, hit
 
 
-def spread(moves: Bools, points: NDArray[np.float32]) -> Bools:
+def extend_to_cubes(moves: Bools, points: NDArray[np.float32]) -> Bools:
     """Mask (N,) extended to all points (N, 3), m, of cubes with a good share of masked points, such as wheels."""
     if not moves.any():
         return moves
@@ -299,8 +299,8 @@ def spread(moves: Bools, points: NDArray[np.float32]) -> Bools:
     at = np.minimum(np.searchsorted(cubes, keys), len(cubes) - 1)
     inside = cubes[at] == keys
     total = np.bincount(at[inside], minlength=len(cubes))
-    chosen = (moving >= 2) & (moving >= SHARE * total)
-    return np.asarray(moves | (inside & chosen[at]))
+    subset = (moving >= 2) & (moving >= SHARE * total)
+    return np.asarray(moves | (inside & subset[at]))
 
 
 def _grid_of(points: NDArray[np.float32]) -> _Grid | None:

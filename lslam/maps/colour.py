@@ -17,7 +17,6 @@ from lslam.core.stopping import checking
 from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.core.types.camera import Image, Lens
 from lslam.core.types.cloud import BLOCK, ArrayCloud, Cloud, CloudBlock
-from lslam.maps.exposure import image_gains
 
 GREY = 128  # of points that no image shows
 CHANNELS = ("red", "green", "blue")
@@ -25,6 +24,8 @@ VIEWS = 7  # kept of a point, of which the median is taken: odd, so that a major
 # Points that are culled together, and those that images are compared by.
 _RUN, _COMPARED = 1 << 12, 1 << 16
 _NEIGHBOURHOOD, _FEWEST = 2.0, 5  # spacings about a point in which its plane lies, and points that make one
+_ROUNDS = 20
+_STEP = 1.0 / 255.0  # of a pixel's value: no two of them agree better than that
 
 
 @dataclass(frozen=True)
@@ -101,7 +102,7 @@ class MapColourer:
         self.images, self.unseen = 0, 0
         count = len(cloud)
         self._origin: Floats = np.zeros(3)
-        self._points = self._stored(np.float32, count, 3)
+        self._points = self._array_on_disk(np.float32, count, 3)
         at = 0
         for block in cloud.blocks():
             if not at:
@@ -112,11 +113,11 @@ class MapColourer:
         self._runs: Longs = np.stack([first, np.minimum(first + _RUN, count)], axis=1)
         bounds = [(self._points[a:b].min(0), self._points[a:b].max(0)) for a, b in self._runs]
         self._low, self._high = (np.array([pair[k] for pair in bounds]).reshape(-1, 3) for k in (0, 1))
-        self._normals = self._stored(np.int8, count, 3)
+        self._normals = self._array_on_disk(np.int8, count, 3)
         self._estimate_normals()
-        self._ranks = self._stored(np.float32, count, VIEWS)
-        self._views = self._stored(np.int32, count, VIEWS)
-        self._colours = self._stored(np.uint8, count, VIEWS, 3)
+        self._ranks = self._array_on_disk(np.float32, count, VIEWS)
+        self._views = self._array_on_disk(np.int32, count, VIEWS)
+        self._colours = self._array_on_disk(np.uint8, count, VIEWS, 3)
 
     def add(
         self, image: Image, lens: Lens, T_world_camera: Floats, others: Iterable[Floats] = (), weight: float = 1.0
@@ -163,7 +164,7 @@ class MapColourer:
         step = max(1, len(self._cloud) // _COMPARED)
         some = slice(None, None, step)
         gains = image_gains(self._views[some], self._colours[some], self._ranks[some] > 0, self.images)
-        out = self._stored(np.uint8, len(self._cloud), 3)
+        out = self._array_on_disk(np.uint8, len(self._cloud), 3)
         out[:] = GREY
         self.unseen = int(medians(self._ranks, self._views, self._colours, gains, out))
         return ColouredCloud(self._cloud, out)
@@ -195,7 +196,7 @@ class MapColourer:
             units = normals(points[order], keys[order], queries, corner, radius, _FEWEST)
             self._normals[a:b] = np.rint(127 * units)
 
-    def _stored(self, kind: type[Any], count: int, *shape: int) -> NDArray[Any]:
+    def _array_on_disk(self, kind: type[Any], count: int, *shape: int) -> NDArray[Any]:
         """Array (count, *shape) of zeros in a temporary file that goes with it; room on the disk is taken at once."""
         row = np.dtype(kind).itemsize * int(np.prod(shape))
         if not count:
@@ -215,3 +216,48 @@ def warm_up() -> None:
     colourer = MapColourer(ArrayCloud.of(grid), 1.0, 10.0)
     colourer.add(np.zeros((8, 8, 3), np.uint8), Lens("pinhole", (8, 8), (8.0, 8.0, 3.5, 3.5)), np.eye(4))
     colourer.result()
+
+
+def image_gains(views: NDArray[np.int32], colours: NDArray[np.uint8], is_view: Bools, images: int) -> Floats:
+    """Gains (V, 3) of `images` images, about 1: the value of a pixel is the gain times the colour of its point.
+
+    views, is_view : (N, K) the images that show each point, and where there is one; colours : (N, K, 3)
+
+    Least squares of the logarithms, every point's colour eliminated, with Cauchy weights by the median deviation, since some
+    views show what passed before the point. One observation of gain 1 for every image fixes what the points leave open.
+    """
+    unsaturated = is_view & ((colours > 0) & (colours < 255)).all(2)
+    several = unsaturated.sum(1) > 1
+    point, slot = np.nonzero(unsaturated[several])
+    gains = np.ones((images, 3))
+    if not len(point):
+        return gains
+    view = views[several][point, slot]
+    logs = np.log(colours[several][point, slot].astype(np.float64))
+    for channel in range(3):
+        gains[:, channel] = np.exp(_log_gains(point, view, logs[:, channel], images))
+    return gains
+
+
+def _log_gains(point: NDArray[np.intp], view: NDArray[np.int32], logs: Floats, images: int) -> Floats:
+    """Logarithms of the gains (V,) from the logarithm of each observation (M,), by its point and its view."""
+    from scipy import sparse
+    from scipy.sparse.linalg import spsolve
+
+    points = int(point.max()) + 1
+    weight, gain = np.ones(len(logs)), np.zeros(images)
+    for _ in range(_ROUNDS):
+        total = np.bincount(point, weight, points)
+        share = sparse.csr_array((weight, (point, view)), (points, images))
+        normal = sparse.diags_array(np.bincount(view, weight, images) + 1.0) - share.T @ (
+            sparse.diags_array(1.0 / total) @ share
+        )
+        mean = np.bincount(point, weight * logs, points) / total
+        before, gain = gain, spsolve(sparse.csc_array(normal), np.bincount(view, weight * (logs - mean[point]), images))
+        free = np.bincount(point, weight * (logs - gain[view]), points) / total
+        residual = logs - gain[view] - free[point]
+        scale = max(1.4826 * float(np.median(np.abs(residual))), _STEP)
+        weight = 1.0 / (1.0 + (residual / scale) ** 2)
+        if np.abs(gain - before).max() < _STEP:
+            break
+    return np.asarray(gain, np.float64)

@@ -45,8 +45,8 @@ def crispness(cloud: Cloud, radius: float = RADIUS, least: int = LEAST_POINTS, s
         low = points.min(0)
         keys = cell_keys(points, low, radius)
         order = np.argsort(keys, kind="stable")
-        found = shapes(points[order], keys[order], queries, low, radius, least)
-        good = found[np.isfinite(found[:, 0])]
+        scores = shapes(points[order], keys[order], queries, low, radius, least)
+        good = scores[np.isfinite(scores[:, 0])]
         total += good.sum(0)
         used += len(good)
         sampled += len(queries)

@@ -17,7 +17,7 @@ from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.cloud import BLOCK, CloudBlock, in_memory
 from lslam.core.types.state import State
 from lslam.maps.observations import TAGS, Observations, column_types, columns_of, tags_of
-from lslam.maps.sorted_runs import SortedRuns, StoredRows
+from lslam.maps.sorted_runs import KeyedRows, StoredRows
 
 log = logging.getLogger("lslam")
 
@@ -74,7 +74,7 @@ class MergedMap:
 
     def blocks(self) -> Iterator[CloudBlock]:
         """The points, `BLOCK` at a time."""
-        from lslam.maps.kernels.voxel_average import INTENSITY_UNITS, SUMS, unpack
+        from lslam.maps.kernels.cells import INTENSITY_UNITS, SUMS, unpack
 
         for rows in self._pieces():
             intensity = (
@@ -144,13 +144,10 @@ class MapMerger:
         self._voxel, self._range_min = float(voxel), float(range_min)
         self._range_max = min(float(range_max), 1e150)  # squared it must stay finite, or Inf would pass the gate
         self._origin: Longs | None = None
-        self._most, self._used = most, 0
         self._attributes, self._last_scan = attributes, 0
         self._base = 5 + (TAGS if attributes else 0)  # columns without that of the intensity
-        self._start(columns=self._base)
+        self._most, self._table = most, KeyedRows(self._base, most, spool, keep)
         self._crop = _EVERYWHERE if crop is None else np.asarray(crop, np.float64).reshape(6)
-        self._spool, self._keep = spool, keep
-        self._runs: SortedRuns | None = None
         self._with_intensity: bool | None = None
         self.scans = self.gated = self.outside = self.refused = 0
 
@@ -166,7 +163,7 @@ class MapMerger:
         The map has intensity only when every scan has; an intensity that is not finite counts as 0. A scan whose pose
         is not finite is refused, counted and logged. Raises InputError when points and intensities differ in number.
         """
-        from lslam.maps.kernels.voxel_average import accumulate
+        from lslam.maps.kernels.cells import accumulate
 
         T = np.ascontiguousarray(T_world_lidar, np.float64)
         # Beyond 2**52 voxels the voxel index itself is no longer exact.
@@ -184,10 +181,11 @@ class MapMerger:
             self.scans += 1
             return
         self._settle_intensity(intensity is not None)
-        if self._used + len(cloud) > self._most and self._used:
-            self._spill()
-        self._reserve(self._used + len(cloud))
-        self._used, gated, outside = accumulate(
+        table = self._table
+        if table.used + len(cloud) > self._most and table.used:
+            table.spill()
+        table.reserve(table.used + len(cloud))
+        table.used, gated, outside = accumulate(
             cloud,
             values if self._with_intensity else _NO_INTENSITY,
             tags_of(observations if self._attributes else None),
@@ -197,9 +195,9 @@ class MapMerger:
             self._voxel,
             self._crop,
             self._origin,
-            self._slots,
-            self._rows,
-            self._used,
+            table.slots,
+            table.rows,
+            table.used,
         )
         self.scans += 1
         self._last_scan = max(self._last_scan, 0 if observations is None else observations.scan)
@@ -215,76 +213,31 @@ class MapMerger:
                 self._voxel * 2**20 / 1000,
             )
         origin = np.zeros(3, np.int64) if self._origin is None else self._origin
-        rows: Longs | StoredRows
-        if self._runs is None:
-            rows = self._take()
-        else:
-            self._spill()
-            rows = self._runs.combined(partial(_add_up, has_tags=bool(self._attributes)))
-            self._runs = None
+        rows = self._table.result(partial(_add_up, has_tags=bool(self._attributes)))
         types = column_types(self._attributes, self._last_scan)
         return MergedMap(rows, origin, self._voxel, bool(self._with_intensity), types)
 
     def state(self) -> State:
         """State for `restore`; voxels that changed since the last time are written to `keep`."""
-        if self._used:
-            self._spill()
         counts = (self.scans, self.gated, self.outside, self.refused, self._last_scan)
-        runs = None if self._runs is None else self._runs.state()
+        runs = self._table.state()
         return {"origin": self._origin, "with_intensity": self._with_intensity, "counts": counts, "runs": runs}
 
     def restore(self, state: State) -> None:
         """Restore `state` in an empty merger of the same kind. Raises InputError when voxels are missing."""
-        if state["runs"] is not None:
-            runs = SortedRuns(self._spool, self._keep)
-            runs.restore(state["runs"])
-            self._runs = runs
+        self._table.restore(state["runs"])
         self._origin = state["origin"]
         self.scans, self.gated, self.outside, self.refused, self._last_scan = state["counts"]
         if state["with_intensity"] is not None:
             self._with_intensity = bool(state["with_intensity"])
-            self._start(columns=self._base + self._with_intensity)
+            self._table.set_columns(self._base + self._with_intensity)
 
-    def _take(self) -> Longs:
-        """Sorted rows in memory, which is emptied."""
-        rows = self._rows[: self._used]
-        rows = rows[np.argsort(rows[:, 0])]
-        self._start(columns=self._rows.shape[1])
-        return rows
-
-    def _start(self, columns: int) -> None:
-        """Allocate room for `most` rows; the system provides memory only for rows that are written."""
-        self._rows: Longs = np.empty((self._most, columns), np.int64)
-        self._slots: NDArray[np.int32] = np.full(_slots_for(self._most), -1, np.int32)
-        self._used = 0
-
-    def _spill(self) -> None:
-        if self._runs is None:
-            self._runs = SortedRuns(self._spool, self._keep)
-        self._runs.add(self._take())
-
-    def _settle_intensity(self, given: bool) -> None:
-        if self._with_intensity is None:
-            self._with_intensity = given
-            self._rows = np.empty((len(self._rows), self._base + given), np.int64)
-        elif self._with_intensity and not given:
+    def _settle_intensity(self, has_intensity: bool) -> None:
+        if self._with_intensity and not has_intensity:
             log.warning("merged map: a scan has no intensity, so the map has none")
-            self._with_intensity, self._rows = False, np.ascontiguousarray(self._rows[:, : self._base])
-
-    def _reserve(self, rows: int) -> None:
-        """Ensure room for `rows` rows, even for one scan with more than `most` of them."""
-        from lslam.maps.kernels.voxel_average import enter
-
-        if rows > len(self._rows):
-            more = rows - len(self._rows)
-            self._rows = np.concatenate([self._rows, np.empty((more, self._rows.shape[1]), np.int64)])
-            self._slots = np.full(_slots_for(rows), -1, np.int32)
-            enter(self._slots, self._rows, self._used)
-
-
-def _slots_for(rows: int) -> int:
-    """Number of hash slots: a power of two, at most half full."""
-    return 1 << int(np.ceil(np.log2(max(rows, 1) * 2)))
+        if self._with_intensity is None or (self._with_intensity and not has_intensity):
+            self._with_intensity = has_intensity
+            self._table.set_columns(self._base + has_intensity)
 
 
 def _add_up(rows: Longs, has_tags: bool = False) -> Longs:

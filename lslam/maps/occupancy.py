@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from lslam.core.errors import ConfigError
 from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.core.types.state import State
-from lslam.maps.sorted_runs import SortedRuns
+from lslam.maps.sorted_runs import KeyedRows, StoredRows
 
 # Log-odds in hundredths: hit 0.7, miss 0.4, clamped to 0.12 and 0.97 (OctoMap's): what has left is free after some ten scans.
 MODEL = np.array([85, -41, -200, 350], np.int64)
@@ -63,7 +63,7 @@ class Evidence:
         return len(self.keys)
 
     @property
-    def was_hit(self) -> Bools:
+    def has_hits(self) -> Bools:
         """(M,) whether any beam ended in a cell, as foliage that most beams pass.
 
         A sum is that of hits less what misses take, so it tells the hits modulo a miss: a multiple of that counts as none.
@@ -113,18 +113,13 @@ class OccupancyMapper:
             )
         self._voxel, self._range = float(voxel), (float(range_min), float(range_max))
         self._longest = int(3 * range_max / voxel) + 4
-        self._spool, self._keep, self._most = spool, keep, most
+        self._most, self._table = most, KeyedRows(5, _START_ROWS, spool, keep)
         self._origin = origin
-        self._runs: SortedRuns | None = None
-        self._rows = np.empty((0, 5), np.int64)
-        self._slots = np.empty(0, np.int32)
-        self._used = 0
         self.scans = 0
-        self._reserve(_START_ROWS)
 
     def add(self, points: NDArray[Any], T_world_lidar: Floats) -> None:
         """Add a deskewed scan: points (N, 3), m, in the LiDAR frame, and its pose (4, 4), which is skipped if not finite."""
-        from lslam.maps.kernels.ray_cells import carve, mark_ends
+        from lslam.maps.kernels.cells import carve, mark_ends
 
         T = np.ascontiguousarray(T_world_lidar, np.float64)
         if not np.isfinite(T).all() or np.abs(T[:3, 3]).max() / self._voxel > 2.0**52:
@@ -133,83 +128,47 @@ class OccupancyMapper:
         start = T[:3, 3] / self._voxel
         if self._origin is None:
             self._origin = np.floor(start).astype(np.int64)
-        if self._used > self._most:
-            self._spill()
-        self._reserve(self._used + len(cloud) + self._longest)
+        table = self._table
+        if table.used > self._most:
+            table.spill()
+        table.reserve(table.used + len(cloud) + self._longest)
         stamp = self.scans
         self.scans += 1
-        self._used, ends = mark_ends(
-            cloud, T, *self._range, self._voxel, self._origin, self._slots, self._rows, self._used, stamp, MODEL
+        table.used, ends = mark_ends(
+            cloud, T, *self._range, self._voxel, self._origin, table.slots, table.rows, table.used, stamp, MODEL
         )
         done = 0
         while done < len(ends):
-            self._reserve(self._used + self._longest)
-            self._used, done = carve(
-                ends, done, start, self._longest, self._origin, self._slots, self._rows, self._used, stamp, MODEL
+            table.reserve(table.used + self._longest)
+            table.used, done = carve(
+                ends, done, start, self._longest, self._origin, table.slots, table.rows, table.used, stamp, MODEL
             )
 
     def result(self) -> OccupancyGrid:
         """Grid of the observed cells; empties the mapper."""
-        from lslam.maps.kernels.voxel_average import unpack_cells
+        from lslam.maps.kernels.cells import unpack_cells
 
-        found = self.evidence()
-        return OccupancyGrid(unpack_cells(found.keys, found.origin).astype(np.int32), found.log_odds, self._voxel)
+        evidence = self.evidence()
+        return OccupancyGrid(
+            unpack_cells(evidence.keys, evidence.origin).astype(np.int32), evidence.log_odds, self._voxel
+        )
 
     def evidence(self) -> Evidence:
         """Observed cells with all their evidence; empties the mapper."""
-        from lslam.maps.kernels.ray_cells import compose
+        from lslam.maps.kernels.cells import compose
 
-        if self._runs is None:
-            rows = self._take()
-        else:
-            self._spill()
-            stored = self._runs.combined(compose)
-            rows = stored.read(0, len(stored))
-            self._runs = None
+        rows = self._table.result(compose)
+        if isinstance(rows, StoredRows):
+            rows = rows.read(0, len(rows))
         origin = np.zeros(3, np.int64) if self._origin is None else self._origin
         log_odds = np.clip(rows[:, 1], rows[:, 2], rows[:, 3]).astype(np.int16)
         return Evidence(rows[:, 0].copy(), log_odds, rows[:, 1].copy(), origin, self._voxel)
 
     def state(self) -> State:
         """State for `restore`; cells that changed since the last time are written to `keep`."""
-        if self._used:
-            self._spill()
-        return {
-            "origin": self._origin,
-            "scans": self.scans,
-            "runs": None if self._runs is None else self._runs.state(),
-        }
+        return {"origin": self._origin, "scans": self.scans, "runs": self._table.state()}
 
     def restore(self, state: State) -> None:
         """Restore `state` in an empty mapper of the same kind. Raises InputError when cells are missing."""
-        if state["runs"] is not None:
-            self._runs = SortedRuns(self._spool, self._keep)
-            self._runs.restore(state["runs"])
+        self._table.restore(state["runs"])
         self._origin, self.scans = state["origin"], state["scans"]
-
-    def _take(self) -> Longs:
-        rows = self._rows[: self._used]
-        rows = rows[np.argsort(rows[:, 0])]
-        self._used = 0
-        self._slots[:] = -1
-        return rows
-
-    def _spill(self) -> None:
-        if self._runs is None:
-            self._runs = SortedRuns(self._spool, self._keep)
-        self._runs.add(self._take())
-
-    def _reserve(self, rows: int) -> None:
-        """Ensure room for `rows` rows; the slots stay at most two thirds full."""
-        from lslam.maps.kernels.ray_cells import COLUMNS
-        from lslam.maps.kernels.voxel_average import enter
-
-        if rows > len(self._rows):
-            more = max(rows, len(self._rows) * 3 // 2)
-            grown = np.empty((more, COLUMNS), np.int64)
-            grown[: self._used] = self._rows[: self._used]
-            self._rows = grown
-        # The kernel fills rows to the last one.
-        if len(self._rows) * 3 > len(self._slots) * 2:
-            self._slots = np.full(1 << int(np.ceil(np.log2(len(self._rows) * 2))), -1, np.int32)
-            enter(self._slots, self._rows, self._used)

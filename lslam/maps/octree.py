@@ -30,7 +30,7 @@ def write_octree(
     cloud: Cloud,
     shades: tuple[float, float],
     on_share: Callable[[float], None] = lambda share: None,
-    held: int = HELD,
+    most_points: int = HELD,
 ) -> dict[str, Any]:
     """Write the nodes of the finite points of a cloud one after the other, and return the index.
 
@@ -38,7 +38,7 @@ def write_octree(
 
     spool : folder for the points of nodes that do not fit into memory; shades : intensities that become 0 and 255
     on_share : called with the share that is written, 0 to 1; it may raise to stop
-    held : points that are held in memory
+    most_points : points that are held in memory
 
     Raises OutputError when the disk is full.
     """
@@ -50,13 +50,13 @@ def write_octree(
     columns |= {"rgb": 3} if set(COLOURS) <= set(cloud.column_types) else {}
     columns |= {"class": 1} if "class" in cloud.column_types else {}
     kind = np.dtype([("at", "<f4", (3,)), *((name, "u1", (size,)) for name, size in columns.items())])
-    builder = _Builder(stream, spool, edge, held, on_share)
+    builder = _Builder(stream, spool, edge, most_points, on_share)
     with output_errors(spool):
         root = spool / "r"
         with root.open("wb") as points:
             for block in cloud.blocks():
                 points.write(_records(block, kind, low, shades).tobytes())
-        builder.divide("r", _stored(root, kind, held), np.zeros(3), edge)
+        builder.divide("r", _take_records(root, kind, most_points), np.zeros(3), edge)
     return {
         "low": low.tolist(),
         "edge": edge,
@@ -102,10 +102,10 @@ def _records(block: CloudBlock, kind: np.dtype[Any], low: Floats, shades: tuple[
     return records
 
 
-def _stored(path: Path, kind: np.dtype[Any], held: int) -> Records:
+def _take_records(path: Path, kind: np.dtype[Any], most_points: int) -> Records:
     """The records of a file, in memory where they are few, else mapped; the file is removed."""
     count = path.stat().st_size // kind.itemsize
-    records: Records = np.memmap(path, kind, "r") if count > held else np.fromfile(path, kind)
+    records: Records = np.memmap(path, kind, "r") if count > most_points else np.fromfile(path, kind)
     path.unlink()  # what is mapped stays until nobody has it
     return records
 
@@ -114,11 +114,11 @@ class _Builder:
     """Divides nodes and writes them, parents first; `nodes` has of each, by its name, the first byte and the number of points."""
 
     def __init__(
-        self, stream: BinaryIO, spool: Path, edge: float, held: int, on_share: Callable[[float], None]
+        self, stream: BinaryIO, spool: Path, edge: float, most_points: int, on_share: Callable[[float], None]
     ) -> None:
         self.nodes: dict[str, tuple[int, int]] = {}
         self.written = 0
-        self._stream, self._spool, self._held, self._on_share = stream, spool, held, on_share
+        self._stream, self._spool, self._held, self._on_share = stream, spool, most_points, on_share
         self._edge, self._total = edge, 0
 
     def divide(self, name: str, records: Records, low: Floats, edge: float) -> None:
@@ -145,7 +145,7 @@ class _Builder:
         for k in range(8):
             stored = self._spool / f"{name}{k}"
             if stored.exists():
-                self.divide(f"{name}{k}", _stored(stored, kind, self._held), *cube_of(f"r{k}", low, edge))
+                self.divide(f"{name}{k}", _take_records(stored, kind, self._held), *cube_of(f"r{k}", low, edge))
             elif parts[k]:
                 some, parts[k] = np.concatenate(parts[k]), []
                 self.divide(f"{name}{k}", some, *cube_of(f"r{k}", low, edge))

@@ -1,4 +1,4 @@
-"""Tables of int64 rows larger than memory: sorted runs on disk, merged by ranges of keys."""
+"""Tables of int64 rows larger than memory: hashed by key, and sorted runs on disk, merged by ranges of keys."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class SortedRuns:
 
     def add(self, rows: Rows) -> None:
         """Store a run."""
-        stored = self._stored(f"run-{len(self._runs)}", rows.shape[1])
+        stored = self._rows_file(f"run-{len(self._runs)}", rows.shape[1])
         stored.remove()  # what a process that was killed may have left
         stored.append(rows)
         self._runs.append(stored)
@@ -74,20 +74,20 @@ class SortedRuns:
         """Take over the runs in the folder. Raises InputError when they are missing."""
         self._runs = []
         for k, (count, columns) in enumerate(state["runs"]):
-            stored = self._stored(f"run-{k}", columns)
+            stored = self._rows_file(f"run-{k}", columns)
             stored.find(count)
             self._runs.append(stored)
 
-    def _stored(self, name: str, columns: int) -> StoredRows:
+    def _rows_file(self, name: str, columns: int) -> StoredRows:
         return StoredRows(self._folder / name, columns, self._owner)
 
-    def combined(self, combine: Combine) -> StoredRows:
+    def merge(self, combine: Combine) -> StoredRows:
         """Merge all runs into one table, sorted by key. The runs are deleted, unless their folder is kept.
 
         combine : given rows sorted by key, those of one key in the order of the runs, gives one row per key
         """
         columns = min(run.columns for run in self._runs)
-        whole = self._stored("all", columns)
+        whole = self._rows_file("all", columns)
         whole.remove()
         cuts = self._cuts()
         begins = [0] * len(self._runs)
@@ -162,3 +162,78 @@ class StoredRows:
         for path in (self._path, self._path.with_suffix(".keys")):
             path.unlink(missing_ok=True)
         self._count = 0
+
+
+class KeyedRows:
+    """Rows (n, k), int64, one for each key, which is their first column: in memory, and in sorted runs where they are many.
+
+    Kernels find and enter them by a hash: `rows` (R, k), of which `used` are taken, and `slots` (S,) with the row of each.
+
+    Parameters
+    ----------
+    columns : k; room : rows that there is room for at first
+    beside, folder : as of `SortedRuns`
+    """
+
+    def __init__(self, columns: int, room: int, beside: Path | None, folder: Path | None) -> None:
+        self._places = beside, folder
+        self._runs: SortedRuns | None = None
+        self.rows: Rows = np.empty((0, columns), np.int64)
+        self.slots: NDArray[np.int32] = np.empty(0, np.int32)
+        self.used = 0
+        self.reserve(room)
+
+    def reserve(self, count: int) -> None:
+        """Ensure room for `count` rows; the slots stay at most two thirds full."""
+        from lslam.maps.kernels.cells import enter
+
+        if count > len(self.rows):
+            # The system provides memory only for rows that are written.
+            wider = np.empty((max(count, len(self.rows) * 3 // 2), self.rows.shape[1]), np.int64)
+            wider[: self.used] = self.rows[: self.used]
+            self.rows = wider
+        # Kernels fill rows to the last one.
+        if len(self.rows) * 3 > len(self.slots) * 2:
+            self.slots = np.full(1 << int(np.ceil(np.log2(len(self.rows) * 2))), -1, np.int32)
+            enter(self.slots, self.rows, self.used)
+
+    def set_columns(self, columns: int) -> None:
+        """Keep the first `columns` columns; while no row is taken there may be more."""
+        wider = np.empty((len(self.rows), columns), np.int64)
+        if self.used:
+            wider[: self.used] = self.rows[: self.used, :columns]
+        self.rows = wider
+
+    def spill(self) -> None:
+        """Move the rows in memory to the disk, as one run. Raises OutputError when they cannot be written."""
+        if self._runs is None:
+            self._runs = SortedRuns(*self._places)
+        self._runs.add(self._take())
+
+    def result(self, combine: Combine) -> Rows | StoredRows:
+        """All rows, sorted by key; memory is emptied. Those of one key are combined as by `SortedRuns.merge`."""
+        if self._runs is None:
+            return self._take()
+        self.spill()
+        stored, self._runs = self._runs.merge(combine), None
+        return stored
+
+    def state(self) -> State | None:
+        """State of the runs for `restore`, after all rows were moved to the disk; None without any."""
+        if self.used:
+            self.spill()
+        return None if self._runs is None else self._runs.state()
+
+    def restore(self, state: State | None) -> None:
+        """Take over the runs in the folder. Raises InputError when they are missing."""
+        if state is not None:
+            self._runs = SortedRuns(*self._places)
+            self._runs.restore(state)
+
+    def _take(self) -> Rows:
+        """Sorted rows in memory, which is emptied."""
+        rows = self.rows[: self.used]
+        rows = rows[np.argsort(rows[:, 0])]
+        self.rows, self.used = np.empty_like(self.rows), 0
+        self.slots[:] = -1
+        return rows

@@ -152,7 +152,7 @@ def _metres(ring: Any, origin: Floats) -> Floats:
 def corrected_osm(data: OsmData, corrected_map: CorrectedMap) -> OsmData:
     """The buildings of `corrected_map` with all their nodes, moved, as an extract to open in an editor (JOSM).
 
-    Nodes and ways keep their numbers and versions; those that differ from `data` are `modified`. A node that several
+    Nodes and ways keep their numbers and versions; those that differ from `data` are `edits`. A node that several
     buildings share and that they no longer agree on stays with the one known best; the others get new nodes, with numbers
     below zero. A building of `data` that is not in `corrected_map` holds its nodes where they are. What the run found absent
     is not deleted: it is for a mapper to decide.
@@ -213,11 +213,11 @@ def _place(result: OsmData, wishes: dict[int, list[_NodeTarget]], origin: Floats
             number = node if is_first else next(fresh)
             lat, lon, _ = from_local(np.array([[*best.place, 0.0]]), origin)[0].tolist()
             result.add_node(number, round(lat, DECIMALS), round(lon, DECIMALS))
-            result.modified.add(("node", number))
+            result.edits.add(("node", number))
             for way in [] if is_first else [way for wish in group for way in wish.ways]:
                 held = result.ways[way]
                 result.ways[way] = replace(held, nodes=tuple(number if n == node else n for n in held.nodes))
-                result.modified.add(("way", way))
+                result.edits.add(("way", way))
 
 
 def _agreeing(wishes: list[_NodeTarget]) -> list[list[_NodeTarget]]:

@@ -80,7 +80,7 @@ def merge_replies(replies: Iterable[Any]) -> OsmData:
         items = OverpassReply.of(reply).items_of()
         add_elements(data, items)
         check_reply(items)
-    data.number_drawn()
+    data.number_outlines()
     return data
 
 

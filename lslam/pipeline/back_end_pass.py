@@ -28,9 +28,8 @@ from lslam.core.types.gnss import Georeference
 from lslam.core.types.run_record import RunRecord
 from lslam.core.types.scan_result import KeyframeClocks, ScanResult
 from lslam.core.types.sequence import Sequence
-from lslam.io.formats.g2o import write_g2o
 from lslam.io.formats.state_files import Records
-from lslam.io.formats.trajectory_files import write_tum
+from lslam.io.formats.trajectory_lines import write_g2o, write_tum
 from lslam.odometry.frontend.register_scans import to_trajectory
 from lslam.osm.hold import hold_by_buildings
 from lslam.pipeline.job import PreparedRun

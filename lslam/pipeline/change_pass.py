@@ -18,7 +18,7 @@ from lslam.core.types.arrays import Floats
 from lslam.core.types.gnss import Georeference
 from lslam.core.types.sequence import Sequence
 from lslam.io.formats.geojson import write_areas
-from lslam.io.formats.ply_files import write_ply
+from lslam.io.formats.point_files import write_ply
 from lslam.maps.changes import ChangedCells, MapChange, changed_cells
 from lslam.maps.clean import Cleaner, PosedScan
 from lslam.maps.georeference import to_lat_lon

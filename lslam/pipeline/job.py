@@ -25,7 +25,7 @@ from lslam.core.types.trajectory import Trajectory
 from lslam.evaluation.frames import main_axis
 from lslam.io.readers import open_sequence
 from lslam.io.readers.kitti_raw import with_streams
-from lslam.io.readers.labels import with_labels
+from lslam.io.readers.sequence_on_disk import with_labels
 from lslam.odometry import create_odometry
 from lslam.odometry.base import Odometry
 from lslam.odometry.frontend.checkpoints import Checkpoints, OdometryCheckpoints

@@ -20,8 +20,8 @@ from lslam.core.types.trajectory import Trajectory
 from lslam.core.untrusted import MISFIT, parse_json
 from lslam.io.formats.atomic import atomic_write, write_text
 from lslam.io.formats.geojson import write_line
-from lslam.io.formats.ply_files import write_ply, write_ply_mesh
-from lslam.io.formats.point_files import MAP_SUFFIXES, write_cloud
+from lslam.io.formats.ply_files import write_ply_mesh
+from lslam.io.formats.point_files import MAP_SUFFIXES, write_cloud, write_ply
 from lslam.maps.floor_plan import floor_plan
 from lslam.maps.georeference import ProjectedCloud, Projection, to_lat_lon
 from lslam.maps.mesh import surface

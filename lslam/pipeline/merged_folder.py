@@ -22,8 +22,7 @@ from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.sequence import Sequence as Recording
 from lslam.core.types.trajectory import Trajectory
 from lslam.evaluation.evaluate import evaluate
-from lslam.io.formats.g2o import write_g2o
-from lslam.io.formats.trajectory_files import write_tum
+from lslam.io.formats.trajectory_lines import write_g2o, write_tum
 from lslam.odometry.frontend.checkpoints import Checkpoints
 from lslam.odometry.frontend.register_scans import to_trajectory
 from lslam.pipeline.back_end_pass import describe

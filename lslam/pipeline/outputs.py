@@ -27,8 +27,8 @@ from lslam.core.types.trajectory import Trajectory
 from lslam.evaluation.evaluate import Evaluation
 from lslam.evaluation.timing import AFTER, SAVED
 from lslam.io.formats.atomic import write_text
-from lslam.io.formats.ply_files import write_ply
-from lslam.io.formats.trajectory_files import write_kitti, write_tum
+from lslam.io.formats.point_files import write_ply
+from lslam.io.formats.trajectory_lines import write_kitti, write_tum
 from lslam.pipeline import map_files
 from lslam.pipeline.feature_map_pass import FeatureCloud
 from lslam.pipeline.map_files import LOCAL

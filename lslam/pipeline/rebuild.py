@@ -37,7 +37,7 @@ from lslam.io.formats.point_files import MAP_SUFFIXES, read_cloud
 from lslam.io.formats.state_files import read_npz
 from lslam.io.formats.trajectory_files import read_trajectory
 from lslam.io.readers import open_sequence
-from lslam.io.readers.labels import with_labels
+from lslam.io.readers.sequence_on_disk import with_labels
 from lslam.io.remote import as_path
 from lslam.maps.colour import ColourCounts
 from lslam.maps.crispness import crispness

@@ -11,17 +11,27 @@ from numpy.typing import NDArray
 
 from lslam.core.errors import UsageError
 from lslam.core.types.arrays import Floats
-from lslam.simulation import path as paths
-from lslam.simulation.carpark import build_carpark
 from lslam.simulation.city import City, build_city
-from lslam.simulation.countryside import build_corridor, build_motorway, build_woods
-from lslam.simulation.curve import RouteCurve, stretched
-from lslam.simulation.flight import EightFlight, FreePath, buffeting, climb_spline, eight_flight, fly, gait
+from lslam.simulation.countryside import build_carpark, build_corridor, build_motorway, build_woods
+from lslam.simulation.curve import RouteCurve, Terrain, rolling, stretch
 from lslam.simulation.indoors import build_hall, build_room, build_stairwell
 from lslam.simulation.kinematics import PosePath
 from lslam.simulation.moving import Mover, add_queue, add_traffic
 from lslam.simulation.osm_city import OsmCity
 from lslam.simulation.osm_place import MapExtract, city_of_map, keep_out_of_walls, route_in_map
+from lslam.simulation.path import (
+    EightFlight,
+    FreePath,
+    SpeedProfile,
+    VehiclePath,
+    buffeting,
+    climb_spline,
+    drive,
+    eight_flight,
+    fly,
+    gait,
+    suspension,
+)
 from lslam.simulation.routes import (
     FIRST_VISIT,
     SPARE,
@@ -31,12 +41,11 @@ from lslam.simulation.routes import (
     WayPoints,
     given_route,
     own_route,
+    revisit,
     speed_profile,
-    visited,
 )
 from lslam.simulation.scenario_files import INDOORS, Scenario
 from lslam.simulation.scene_mesh import RayScene, Surface
-from lslam.simulation.terrain import Terrain, rolling
 from lslam.simulation.town import build_town
 
 CORRIDOR_SPARE = 130.0  # m, so that no LiDAR here sees an end of the corridor
@@ -45,6 +54,7 @@ NAMES = {Surface.ROAD: "the ground", Surface.PAVEMENT: "the ground", Surface.LAW
 HALF_WIDTH = 0.7  # m on both sides of the path that must be free as well
 LOWEST = 0.3  # m above the ground
 STEP_S = 0.05  # s
+CarrierPath = VehiclePath | FreePath | EightFlight
 
 
 @dataclass(frozen=True)
@@ -52,7 +62,7 @@ class BuiltScenario:
     """A built scenario: the city, the path of the LiDAR through it, and the number of scans."""
 
     city: City
-    path: paths.VehiclePath | FreePath | EightFlight
+    path: CarrierPath
     scans: int
 
 
@@ -83,7 +93,7 @@ def build_scenario(
         moving = None if count is None else count - standing
         route = given_route(scenario, way_points) if way_points is not None else own_route(scenario, place, moving)
     terrain = _terrain(scenario, place)
-    way = visited(route, scenario, visit)
+    way = revisit(route, scenario, visit)
     _check_radius(scenario, way.line)
     if visit.number:
         shake = np.random.default_rng([*visit.seeds(seed), 2**32 - 3])
@@ -114,18 +124,9 @@ def populate(scenario: Scenario, city: City, path: PosePath, seeds: tuple[int, .
     if traffic.queue_s is not None:
         rng = np.random.default_rng([*seeds, 2**32 - 5])
         queue = add_queue(city.streets, city.terrain, path.poses(np.zeros(1))[0], traffic.queue_s, rng)
-    movers = add_traffic(
-        city.streets,
-        city.terrain,
-        path.poses,
-        path.duration,
-        np.random.default_rng([*seeds, 2**32 - 4]),
-        cars_per_km=traffic.cars,
-        people_per_km=traffic.people,
-        lanes=traffic.lanes,
-        pavement=scenario.layout.road + 0.6 * scenario.layout.pavement,
-        speed=traffic.speed,
-    )
+    pavement = scenario.layout.road + 0.6 * scenario.layout.pavement
+    rng = np.random.default_rng([*seeds, 2**32 - 4])
+    movers = add_traffic(city.streets, city.terrain, path.poses, path.duration, rng, traffic, pavement)
     movers = keep_out_of_walls(movers, city, path.duration) if isinstance(city, OsmCity) else movers
     return [*movers, *queue]
 
@@ -140,11 +141,11 @@ def _city(scenario: Scenario, street: RouteCurve, terrain: Terrain, rng: np.rand
     if world.kind == "street":
         return build_city(street, terrain, scenario.layout, rng)
     if world.kind == "motorway":
-        return build_motorway(stretched(street, SPARE), terrain, scenario.layout, rng)
+        return build_motorway(stretch(street, SPARE), terrain, scenario.layout, rng)
     if world.kind == "corridor":
-        return build_corridor(stretched(street, CORRIDOR_SPARE), terrain, scenario.layout, rng)
+        return build_corridor(stretch(street, CORRIDOR_SPARE), terrain, scenario.layout, rng)
     if world.kind == "woods":
-        return build_woods(stretched(street, SPARE), terrain, scenario.layout, rng)
+        return build_woods(stretch(street, SPARE), terrain, scenario.layout, rng)
     if world.kind == "carpark":
         return build_carpark(street, terrain, scenario.layout, world.roughness, rng)
     if world.kind == "hall":
@@ -153,7 +154,7 @@ def _city(scenario: Scenario, street: RouteCurve, terrain: Terrain, rng: np.rand
         return build_stairwell(street, terrain, rng)
     if world.kind == "room":
         return build_room(street, terrain, rng)
-    return build_town([stretched(street, SPARE)], terrain, scenario.layout, rng, world.spacing, world.levels)
+    return build_town([stretch(street, SPARE)], terrain, scenario.layout, rng, world.spacing, world.levels)
 
 
 def _check_radius(scenario: Scenario, line: RouteCurve) -> None:
@@ -171,7 +172,7 @@ def _check_radius(scenario: Scenario, line: RouteCurve) -> None:
 
 def _move(
     scenario: Scenario, route: Route, terrain: Terrain, count: int | None, standing: int, rng: np.random.Generator
-) -> tuple[paths.VehiclePath | FreePath | EightFlight, int]:
+) -> tuple[CarrierPath, int]:
     """The path, and the number of scans: `count`, or one lap, or all that fit on an open line."""
     line, rate = route.line, scenario.rate_hz
     distance = line.length
@@ -190,14 +191,14 @@ def _move(
         return path, fits if count is None else count
     if count is None:
         assert not isinstance(path, EightFlight)  # whose line is open
-        reached = path.travelled(np.arange(fits) / rate)
+        reached = path.distance(np.arange(fits) / rate)
         count = int(np.searchsorted(reached, line.length + scenario.overlap)) + 1
     return path, min(count, fits)
 
 
 def _make_path(
     scenario: Scenario, route: Route, terrain: Terrain, distance: float, rng: np.random.Generator
-) -> paths.VehiclePath | FreePath | EightFlight:
+) -> CarrierPath:
     """Path of the LiDAR along the route, `distance` m, by its carrier: car, walker or drone."""
     line, section = route.line, scenario.path
     if section.shape == "eights":
@@ -206,14 +207,14 @@ def _make_path(
         return eight_flight(rng, np.array([*above, section.heights[0]]), scenario.speed, scenario.lateral, swing)
     profile = speed_profile(scenario)
     if scenario.carrier == "car":
-        return paths.drive(line, terrain, profile, distance, scenario.lidar_height, paths.suspension(rng))
+        return drive(line, terrain, profile, distance, scenario.lidar_height, suspension(rng))
     nodes: tuple[Any, Any] = route.climb or (np.array([0.0, line.length]), np.array(section.heights))
     climb = climb_spline(line, *nodes, section.smoothing)
     if scenario.carrier == "walker":
-        profile = paths.SpeedProfile(scenario.speed, scenario.start_speed, 0.8, 0.8, scenario.lateral)
+        profile = SpeedProfile(scenario.speed, scenario.start_speed, 0.8, 0.8, scenario.lateral)
         return fly(line, profile, distance, climb, 0.0, gait(rng, section.swing), terrain)
     # A drone holds its speed through the bends it was allowed.
-    steady = paths.SpeedProfile(scenario.speed, scenario.start_speed, lateral=1e6)
+    steady = SpeedProfile(scenario.speed, scenario.start_speed, lateral=1e6)
     return fly(line, steady, distance, climb, section.bank, buffeting(rng, section.swing))
 
 

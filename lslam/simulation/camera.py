@@ -14,39 +14,20 @@ from lslam.core.geometry import portable, se3
 from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.camera import Camera, Image, Lens
 from lslam.io.formats.atomic import write_text
-from lslam.io.formats.camera_info import CameraInfo
 from lslam.io.formats.image_files import write_png
+from lslam.io.formats.sequence_toml import CameraInfo
 from lslam.simulation.lidar import Meeting
 from lslam.simulation.moving import moving_meshes
 from lslam.simulation.returns import Rays
 from lslam.simulation.scenarios import SPARE_REACH, SimulatedDrive
-from lslam.simulation.scene_mesh import Surface
+from lslam.simulation.scene_mesh import LOOKS, Surface
 
 NAME = "front"
 FRONT = Lens("pinhole", (400, 300), (250.0, 250.0, 199.5, 149.5), (-0.05, 0.01, 0.0005, -0.0005))
 _SEED = 2**32 - 19  # of exposures and pixel noise
 
-# Red, green, blue of each surface, apart from one another by more than exposure and noise.
-COLOURS = np.zeros((len(Surface) + 1, 3), np.float32)
-COLOURS[-1] = (200, 225, 250)  # the sky
-for _surface, _colour in {
-    Surface.ROAD: (95, 95, 100),
-    Surface.PAVEMENT: (165, 160, 150),
-    Surface.LAWN: (60, 150, 50),
-    Surface.WALL: (215, 160, 100),
-    Surface.GLASS: (60, 90, 170),
-    Surface.ROOF: (170, 60, 40),
-    Surface.FOLIAGE: (35, 95, 40),
-    Surface.TRUNK: (105, 70, 40),
-    Surface.POLE: (205, 205, 60),
-    Surface.CAR: (200, 30, 130),
-    Surface.FENCE: (150, 110, 180),
-    Surface.PERSON: (240, 120, 20),
-    Surface.CROWN: (90, 130, 20),
-    Surface.HEDGE: (20, 110, 90),
-    Surface.PANE: (200, 30, 130),  # clear: what is behind it is the car as well
-}.items():
-    COLOURS[_surface] = _colour
+SKY_COLOUR = (200, 225, 250)
+COLOURS = np.array([*(LOOKS[surface].colour for surface in Surface), SKY_COLOUR], np.float32)
 
 
 @dataclass(frozen=True)
@@ -55,7 +36,7 @@ class CameraModel:
 
     lens : its projection; exposure_s : of an image; instants : at which the scene is seen during the exposure, blur between them
     late_s : from the stamp of a scan to the middle of the exposure of the image that follows
-    exposure_spread : standard deviation of the logarithm of the brightness, which wanders from image to image
+    exposure_sigma : standard deviation of the logarithm of the brightness, which wanders from image to image
     noise : standard deviation of a pixel's values
     """
 
@@ -63,7 +44,7 @@ class CameraModel:
     exposure_s: float = 0.01
     instants: int = 3
     late_s: float = 0.037
-    exposure_spread: float = 0.15
+    exposure_sigma: float = 0.15
     noise: float = 2.0
 
 
@@ -124,7 +105,7 @@ class SimulatedCamera:
         level, levels = 0.0, np.empty(len(self))
         stay = np.exp(-0.1)
         for k in range(len(self)):
-            level = stay * level + self.model.exposure_spread * float(np.sqrt(1 - stay**2)) * rng.standard_normal()
+            level = stay * level + self.model.exposure_sigma * float(np.sqrt(1 - stay**2)) * rng.standard_normal()
             levels[k] = level
         return np.exp(levels)
 

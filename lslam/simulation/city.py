@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -13,10 +13,8 @@ from lslam.core.config.input import Section
 from lslam.core.geometry import portable
 from lslam.core.types.arrays import Floats
 from lslam.simulation import furniture
-from lslam.simulation.curve import RouteCurve
-from lslam.simulation.houses import house
-from lslam.simulation.scene_mesh import MeshBuilder, SceneMesh, Surface, grid_faces
-from lslam.simulation.terrain import Terrain
+from lslam.simulation.curve import RouteCurve, Terrain
+from lslam.simulation.scene_mesh import MeshBuilder, SceneMesh, Surface, grid_faces, grid_vertices
 
 KERB = 0.12  # m
 MARGIN_M = 60.0  # m of ground beyond the street on every side
@@ -53,7 +51,7 @@ class Layout(Section):
     camber: float = Field(0.0, ge=0, le=0.1)
 
     @model_validator(mode="after")
-    def _ranges_are_ordered(self) -> Layout:
+    def _check_ranges(self) -> Layout:
         for name, least in (("house_width", 3), ("house_depth", 3), ("gap", 0), ("setback", 0), ("storeys", 1)):
             low, high = getattr(self, name)
             if not least <= low <= high:
@@ -82,19 +80,52 @@ class City:
     streets: list[RouteCurve] = field(default_factory=list)
 
 
+@dataclass(frozen=True)
+class Site:
+    """A place while it is built along a street: its mesh so far, its ground, its measures, and the generator of what varies."""
+
+    builder: MeshBuilder
+    street: RouteCurve
+    terrain: Terrain
+    layout: Layout
+    rng: np.random.Generator
+
+    @classmethod
+    def begin(cls, street: RouteCurve, terrain: Terrain, layout: Layout, rng: np.random.Generator) -> Site:
+        """A place without anything."""
+        return cls(MeshBuilder(), street, terrain, layout, rng)
+
+    def along(self, street: RouteCurve) -> Site:
+        """The same place along another street."""
+        return replace(self, street=street)
+
+    def beside(self, s: float, offset: float) -> Floats:
+        """(2,) position `s` m along the street and `offset` m to its left."""
+        return np.asarray(self.street.beside(np.array([s]), offset)[0])
+
+    def yaw(self, s: float, side: int = 1) -> float:
+        """Heading of the street `s` m along it, rad; of its other side against it."""
+        tangent = self.street.tangent(np.array([s]))[0] * side
+        return float(portable.arctan2(tangent[1], tangent[0]))
+
+    def stand(self, part: SceneMesh, xy: Floats, yaw: float = 0.0, lift: float = 0.0) -> None:
+        """Stand a mesh at a position (2,), `lift` m above the terrain."""
+        self.builder.add_mesh(part, [*xy, float(self.terrain.height(xy)) + lift], yaw)
+
+
 def build_city(street: RouteCurve, terrain: Terrain, layout: Layout, rng: np.random.Generator) -> City:
     """Build a town along `street`. The same generator state gives the same town."""
-    builder = MeshBuilder()
-    _add_road(builder, street, terrain, layout, rng)
-    add_ground(builder, [street], terrain, layout, rng, 0.75 * layout.pavement)
+    site = Site.begin(street, terrain, layout, rng)
+    add_road(site)
+    add_ground(site, [street], 0.75 * layout.pavement)
     lots = Lots([street], layout)
     for side in (1, -1):
-        add_row(builder, lots, street, terrain, layout, rng, side, first=True)
+        add_row(site, lots, side, first=True)
     for side in (1, -1):
-        add_row(builder, lots, street, terrain, layout, rng, side, first=False)
-        add_street_furniture(builder, street, terrain, layout, rng, side)
-    add_garden_trees(builder, lots, terrain, layout, rng)
-    return City(builder.build(), terrain, street, lots.footprints, lots.heights, [street])
+        add_row(site, lots, side, first=False)
+        add_street_furniture(site, side)
+    add_garden_trees(site, lots)
+    return City(site.builder.build(), terrain, street, lots.footprints, lots.heights, [street])
 
 
 class Lots:
@@ -137,45 +168,37 @@ def _circle(corners: Floats) -> tuple[float, float, float]:
     return float(middle[0]), float(middle[1]), float(np.linalg.norm(corners - middle, axis=1).max())
 
 
-def _add_road(
-    builder: MeshBuilder, street: RouteCurve, terrain: Terrain, layout: Layout, rng: np.random.Generator
-) -> None:
-    """Add road, kerbs and pavements as one strip along the street."""
+def add_road(site: Site, away: Callable[[Floats], Floats] | None = None) -> None:
+    """Add road, kerbs and pavements as one strip along the street.
+
+    away : distance of places (..., 2) to the nearest middle of a road, m: where another road crosses there is no kerb
+    """
+    street, layout = site.street, site.layout
     s = street.sample(0.75)
     if street.closed:
         s = np.append(s, 0.0)
-    half = [0.0, 1.5, 3.0, layout.road, layout.road + 0.02, layout.band]
+    between = [] if away is None else [0.5 * (layout.road + layout.band)]
+    half = [0.0, 1.5, 3.0, layout.road, layout.road + 0.02, *between, layout.band]
     offsets = np.array([-d for d in half[:0:-1]] + half)
-    lift = np.where(np.abs(offsets) > layout.road + 0.01, KERB, 0.0)
     xy = np.stack([street.beside(s, d) for d in offsets])
-    rough = rng.normal(0, 0.003, xy.shape[:2])
+    raised = np.broadcast_to(np.abs(offsets)[:, None] > layout.road + 0.01, xy.shape[:2])
+    if away is not None:
+        raised = raised & (away(xy) > layout.road + 0.005)
+    rough = site.rng.normal(0, 0.003, xy.shape[:2])
     if street.closed:
         rough[:, -1] = rough[:, 0]
-    z = terrain.height(xy) + lift[:, None] + rough
+    z = site.terrain.height(xy) + KERB * raised + rough
     if layout.camber:
-        z += crown_of_road(offsets, layout)[:, None]
-    faces = grid_faces(len(offsets), len(s))
-    kinds = np.where((lift[:-1] > 0) | (lift[1:] > 0), Surface.PAVEMENT, Surface.ROAD).astype(np.uint8)
-    builder.add(np.concatenate([xy, z[..., None]], -1).reshape(-1, 3), faces, np.repeat(kinds, 2 * (len(s) - 1)))
+        z += (layout.camber * np.maximum(layout.road - np.abs(offsets), 0.0))[:, None]
+    faces = grid_faces(*z.shape)
+    kinds = np.where(raised.ravel()[faces].any(axis=1), Surface.PAVEMENT, Surface.ROAD).astype(np.uint8)
+    site.builder.add(grid_vertices(xy, z), faces, kinds)
 
 
-def crown_of_road(offsets: Floats, layout: Layout) -> Floats:
-    """Height (N,), m, of a cambered road above its edges, at `offsets` (N,), m, from its middle."""
-    return np.asarray(layout.camber * np.maximum(layout.road - np.abs(offsets), 0.0))
+def add_ground(site: Site, streets: list[RouteCurve], overlap: float, level: float = KERB - 0.07) -> None:
+    """Add grass everywhere but on `streets`, `level` m above the terrain.
 
-
-def add_ground(
-    builder: MeshBuilder,
-    streets: list[RouteCurve],
-    terrain: Terrain,
-    layout: Layout,
-    rng: np.random.Generator,
-    tucked: float,
-    level: float = KERB - 0.07,
-) -> None:
-    """Add grass everywhere else, `level` m above the terrain.
-
-    It reaches `tucked` m under pavements, or under roads without any. The level is a little below theirs, so that their edge
+    It reaches `overlap` m under pavements, or under roads without any. The level is a little below theirs, so that their edge
     is visible and no grass pokes through.
     """
     from scipy.spatial import cKDTree
@@ -184,25 +207,16 @@ def add_ground(
     low, high = middle.min(0) - MARGIN_M, middle.max(0) + MARGIN_M
     x, y = (np.arange(low[k], high[k] + 1.0, 1.0) for k in (0, 1))
     xy = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
-    z = terrain.height(xy) + level + rng.normal(0, 0.015, xy.shape[:2])
-    nearest = np.asarray(cKDTree(middle).query(xy.reshape(-1, 2), distance_upper_bound=layout.band)[0])
-    under_road = nearest < layout.band - tucked
-    faces = grid_faces(len(x), len(y))
-    faces = faces[~under_road[faces].any(axis=1)]
-    builder.add(np.concatenate([xy, z[..., None]], -1).reshape(-1, 3), faces, Surface.LAWN)
+    z = site.terrain.height(xy) + level + site.rng.normal(0, 0.015, xy.shape[:2])
+    nearest = np.asarray(cKDTree(middle).query(xy.reshape(-1, 2), distance_upper_bound=site.layout.band)[0])
+    under_road = nearest < site.layout.band - overlap
+    faces = grid_faces(*z.shape)
+    site.builder.add(grid_vertices(xy, z), faces[~under_road[faces].any(axis=1)], Surface.LAWN)
 
 
-def add_row(
-    builder: MeshBuilder,
-    lots: Lots,
-    street: RouteCurve,
-    terrain: Terrain,
-    layout: Layout,
-    rng: np.random.Generator,
-    side: int,
-    first: bool,
-) -> None:
+def add_row(site: Site, lots: Lots, side: int, first: bool) -> None:
     """Add houses side by side along one side of the street (1 left, -1 right), where there is room."""
+    street, layout, rng = site.street, site.layout, site.rng
     s, setback = rng.uniform(0, 4), rng.uniform(*layout.setback)
     while s < street.length:
         width = rng.uniform(*layout.house_width)
@@ -216,22 +230,21 @@ def add_row(
         along = 1 / np.clip(1 - side * offset * bend, 0.6, 3.0)
         position, tangent = _front(street, s + along * width / 2, side, offset)
         yaw = float(portable.arctan2(tangent[1], tangent[0]))
-        placed = False
+        is_built = False
         # Most places are taken, and where the shallowest house has no room none has.
-        for share in (1.0, 0.8, 0.65) if lots.is_free(_lot(position, tangent, width, 0.65 * depth)) else ():
-            corners = _lot(position, tangent, width, share * depth)
+        for share in (1.0, 0.8, 0.65) if lots.is_free(lot(position, tangent, width, 0.65 * depth)) else ():
+            corners = lot(position, tangent, width, share * depth)
             if share == 0.65 or lots.is_free(corners):
-                ground = float(terrain.height(position)) + KERB
                 plan = np.random.default_rng(1) if layout.identical else rng
-                building = house(plan, width, share * depth, layout.storeys)
+                building = furniture.house(plan, width, share * depth, layout.storeys)
                 lots.take(corners, float(building.vertices[:, 2].max()))
-                builder.add_mesh(building, [*position, ground], yaw)
+                site.stand(building, position, yaw, KERB)
                 if first and setback > 1.8:
-                    _add_front_garden(builder, rng, layout, width, setback, [*position, ground], yaw)
-                placed = True
+                    _add_front_garden(site, width, setback, position, yaw)
+                is_built = True
                 break
         opening = 9.0 if first and rng.random() < layout.openings else rng.uniform(*layout.gap)
-        s += along * (width + opening) if placed else 1.0
+        s += along * (width + opening) if is_built else 1.0
 
 
 def _front(street: RouteCurve, s: float, side: int, offset: float) -> tuple[Floats, Floats]:
@@ -241,84 +254,66 @@ def _front(street: RouteCurve, s: float, side: int, offset: float) -> tuple[Floa
     return street.position(at)[0] + side * offset * np.array([-tangent[1], tangent[0]]), tangent * side
 
 
-def _lot(front: Floats, tangent: Floats, width: float, depth: float) -> Floats:
-    """Outline (4, 2) of a house behind `front`, as `_front` gives it."""
+def lot(front: Floats, tangent: Floats, width: float, depth: float) -> Floats:
+    """Outline (4, 2) of a house behind the middle `front` (2,) of its front, along the unit vector `tangent` (2,)."""
     inward = np.array([-tangent[1], tangent[0]])
     half = width / 2 * tangent
     return np.array([front - half, front + half, front + half + depth * inward, front - half + depth * inward])
 
 
-def _add_front_garden(
-    builder: MeshBuilder,
-    rng: np.random.Generator,
-    layout: Layout,
-    width: float,
-    setback: float,
-    position: Any,
-    yaw: float,
-) -> None:
+def _add_front_garden(site: Site, width: float, setback: float, front: Floats, yaw: float) -> None:
     """Add a hedge or a low wall between garden and pavement."""
+    rng = site.rng
     kind = rng.random()
-    if kind > layout.gardens:
+    if kind > site.layout.gardens:
         return
     length, across = width * rng.uniform(0.5, 0.95), -(setback - 0.2)
     shift = rng.uniform(-0.5, 0.5) * (width - length)
     c, s = portable.cos(yaw), portable.sin(yaw)
-    place = np.asarray(position) + np.array([c * shift - s * across, s * shift + c * across, 0])
-    part = furniture.hedge(rng, length, layout.volumes) if kind < 0.4 else furniture.garden_wall(rng, length)
-    builder.add_mesh(part, place, yaw)
+    ground = float(site.terrain.height(front)) + KERB
+    place = np.array([*front, ground]) + np.array([c * shift - s * across, s * shift + c * across, 0])
+    part = furniture.hedge(rng, length, site.layout.volumes) if kind < 0.4 else furniture.garden_wall(rng, length)
+    site.builder.add_mesh(part, place, yaw)
 
 
-def add_street_furniture(
-    builder: MeshBuilder,
-    street: RouteCurve,
-    terrain: Terrain,
-    layout: Layout,
-    rng: np.random.Generator,
-    side: int,
-    allowed: Callable[[Floats, float, float], bool] | None = None,
-) -> None:
+def add_street_furniture(site: Site, side: int, is_free: Callable[[Floats, float, float], bool] | None = None) -> None:
     """Add parked cars, trees, poles and bins along one side.
 
-    `allowed` tells whether a place (2,), with its offset and yaw, is free.
+    `is_free` tells whether a place (2,), with its offset and yaw, is free.
     """
+    street, layout, rng = site.street, site.layout, site.rng
 
-    def put(part: SceneMesh, s: float, offset: float, lift: float, turn: float = 0.0) -> None:
-        at = np.array([s])
-        xy, tangent = street.beside(at, side * offset)[0], street.tangent(at)[0] * side
-        yaw = float(portable.arctan2(tangent[1], tangent[0])) + turn
-        if allowed is not None and not allowed(xy, offset, yaw):
-            return
-        builder.add_mesh(part, [*xy, float(terrain.height(xy)) + lift], yaw)
+    def place(part: SceneMesh, s: float, offset: float, lift: float, turn: float = 0.0) -> None:
+        xy, yaw = site.beside(s, side * offset), site.yaw(s, side) + turn
+        if is_free is None or is_free(xy, offset, yaw):
+            site.stand(part, xy, yaw, lift)
 
     for s in _stations(rng, street.length, 5.6, 8.0):
         # Nobody parks in a bend.
         if rng.random() < layout.parked and abs(float(street.curvature(np.array([s]))[0])) < 0.06:
             turn = rng.normal(0, 0.02) + (np.pi if rng.random() < 0.2 else 0.0)
-            put(furniture.parked_car(rng), s, layout.road - 1.05 + rng.uniform(-0.12, 0.12), 0.0, turn)
+            place(furniture.parked_car(rng), s, layout.road - 1.05 + rng.uniform(-0.12, 0.12), 0.0, turn)
     for s in _stations(rng, street.length, 8.0, 15.0):
         if rng.random() < layout.trees:
-            put(furniture.tree(rng, layout.volumes), s, layout.road + 0.7, KERB)
+            place(furniture.tree(rng, layout.volumes), s, layout.road + 0.7, KERB)
     for s in _stations(rng, street.length, 14.0, 30.0) if layout.poles and not layout.identical else ():
-        put(furniture.pole(rng), s, layout.road + 0.4, KERB, np.pi)
+        place(furniture.pole(rng), s, layout.road + 0.4, KERB, np.pi)
     for s in np.arange(7.0, street.length, 28.0) if layout.poles and layout.identical else ():
-        put(furniture.pole(np.random.default_rng(1)), float(s), layout.road + 0.4, KERB, np.pi)
+        place(furniture.pole(np.random.default_rng(1)), float(s), layout.road + 0.4, KERB, np.pi)
     for s in _stations(rng, street.length, 18.0, 40.0) if layout.bins else ():
-        put(furniture.bins(rng), s, layout.band - 0.5, KERB)
+        place(furniture.bins(rng), s, layout.band - 0.5, KERB)
 
 
-def add_garden_trees(
-    builder: MeshBuilder, lots: Lots, terrain: Terrain, layout: Layout, rng: np.random.Generator
-) -> None:
+def add_garden_trees(site: Site, lots: Lots) -> None:
     """Add trees wherever a random place is free."""
-    if not layout.garden_trees:
+    count, rng = site.layout.garden_trees, site.rng
+    if not count:
         return
     middle = np.concatenate([street.position(street.sample(5.0)) for street in lots.streets])
-    count = layout.garden_trees
     for place in middle.repeat(count, axis=0) + rng.uniform(-35, 35, (count * len(middle), 2)):
         corners = place + 1.2 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
         if lots.is_free(corners):
-            builder.add_mesh(furniture.tree(rng, layout.volumes), [*place, float(terrain.height(place)) + KERB])
+            site.stand(furniture.tree(rng, site.layout.volumes), place, lift=KERB)
 
 
 def _stations(rng: np.random.Generator, length: float, shortest: float, longest: float) -> Floats:

@@ -1,4 +1,4 @@
-"""Smooth planar curves by arc length: the middle of a street, and the line a vehicle drives."""
+"""Smooth planar curves by arc length: the middle of a street, and the line a vehicle drives; and the uneven ground below them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def interpolating_spline(x: NDArray[Any], y: NDArray[Any], closed: bool = False)
     """
     from scipy.interpolate import BSpline
 
-    from lslam.simulation.kernels.banded import solve_banded
+    from lslam.simulation.kernels import solve_banded
 
     x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)
     if closed:
@@ -41,7 +41,7 @@ def interpolating_spline(x: NDArray[Any], y: NDArray[Any], closed: bool = False)
     return BSpline(knots, coefficients.reshape(y.shape), DEGREE)
 
 
-def smoothed(values: NDArray[Any], sigma: float, mode: Literal["reflect", "wrap"] = "reflect") -> Floats:
+def gaussian_smooth(values: NDArray[Any], sigma: float, mode: Literal["reflect", "wrap"] = "reflect") -> Floats:
     """`values` (N, ...) convolved along their first axis by a Gaussian of `sigma` steps; `mode` as scipy.ndimage's."""
     from scipy.ndimage import correlate1d
 
@@ -105,19 +105,19 @@ def smooth_curve(points: NDArray[Any], closed: bool, smoothing: float = 1.5) -> 
         points = np.concatenate([points, points[:1]])
     even, step = _resample(points)
     if closed:
-        even = smoothed(even[:-1], smoothing / step, "wrap")
+        even = gaussian_smooth(even[:-1], smoothing / step, "wrap")
         even = np.concatenate([even, even[:1]])
     else:
         # Mirroring the differences, not the positions, keeps the ends where they are and straight.
         reach = int(np.ceil(4 * smoothing / step))
         ahead, behind = 2 * even[0] - even[reach:0:-1], 2 * even[-1] - even[-2 : -reach - 2 : -1]
-        even = smoothed(np.concatenate([ahead, even, behind]), smoothing / step)[reach:-reach]
+        even = gaussian_smooth(np.concatenate([ahead, even, behind]), smoothing / step)[reach:-reach]
     knots = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(even, axis=0), axis=1))])
     spline = interpolating_spline(knots, even, closed)
     return RouteCurve(spline, float(knots[-1]), closed)
 
 
-def stretched(curve: RouteCurve, by: float) -> RouteCurve:
+def stretch(curve: RouteCurve, by: float) -> RouteCurve:
     """Open curve extended straight by `by` m at both ends; a closed one is returned unchanged."""
     if curve.closed or by <= 0:
         return curve
@@ -154,3 +154,59 @@ def winding_line(rng: np.random.Generator, length: float, bend: float = 0.22) ->
         heading += bend * share * portable.sin(2 * np.pi * s / wavelength + rng.uniform(0, 2 * np.pi))
     steps = np.stack([portable.cos(heading), portable.sin(heading)], axis=1)
     return np.asarray(np.cumsum(steps, axis=0))
+
+
+@dataclass(frozen=True)
+class Terrain:
+    """Gently uneven ground: K plane waves `amplitude sin(wave . xy + phase)` on a plane, so height and gradient are exact.
+
+    waves : (K, 2) wave vectors, rad/m; amplitudes : (K,) m; phases : (K,) rad
+    tilt : gradient of the plane, m/m
+    """
+
+    waves: Floats
+    amplitudes: Floats
+    phases: Floats
+    tilt: tuple[float, float] = (0.0, 0.0)
+
+    def height(self, xy: NDArray[Any]) -> Floats:
+        """Height at (..., 2) positions, m, shape (...)."""
+        heights = portable.sin(self._phases_at(xy))
+        return portable.dot(heights, self.amplitudes) + portable.dot(np.asarray(xy, np.float64), np.array(self.tilt))
+
+    def slope(self, xy: NDArray[Any]) -> Floats:
+        """Gradient of the height at (..., 2) positions, m/m, shape (..., 2)."""
+        steepness = portable.cos(self._phases_at(xy)) * self.amplitudes
+        return np.stack([portable.dot(steepness, self.waves[:, k]) + self.tilt[k] for k in (0, 1)], axis=-1)
+
+    def _phases_at(self, xy: NDArray[Any]) -> Floats:
+        """(..., K) of the waves, rad."""
+        xy = np.asarray(xy, np.float64)
+        return np.asarray(xy[..., :1] * self.waves[:, 0] + xy[..., 1:] * self.waves[:, 1] + self.phases)
+
+
+def rolling(
+    rng: np.random.Generator,
+    relief: float = 0.35,
+    unevenness: float = 0.012,
+    swell: float = 100.0,
+    slope: tuple[float, float] = (0.0, 0.0),
+) -> Terrain:
+    """Uneven ground: about `relief` m up and down over about `swell` m, bumps of about `unevenness` m over 7 to 20 m.
+
+    slope : least and greatest slope of the whole, m/m, in a random direction
+    """
+    lengths = np.concatenate([rng.uniform(0.6, 1.4, 4) * swell, rng.uniform(7, 20, 5)])
+    amplitudes = np.concatenate([rng.uniform(0.4, 1.0, 4) * relief, rng.uniform(0.4, 1.0, 5) * unevenness])
+    heading = rng.uniform(0, 2 * np.pi, len(lengths))
+    waves = (2 * np.pi / lengths)[:, None] * np.stack([portable.cos(heading), portable.sin(heading)], axis=1)
+    phases = rng.uniform(0, 2 * np.pi, len(lengths))
+    fall, towards = rng.uniform(*slope), rng.uniform(0, 2 * np.pi)
+    return Terrain(
+        waves, amplitudes, phases, (float(fall * portable.cos(towards)), float(fall * portable.sin(towards)))
+    )
+
+
+def flat() -> Terrain:
+    """Ground at height zero everywhere."""
+    return Terrain(np.zeros((1, 2)), np.zeros(1), np.zeros(1))

@@ -10,7 +10,7 @@ from pydantic import Field
 from lslam.core.config.input import Section
 from lslam.core.errors import UsageError, nearest
 from lslam.core.geometry import portable, se3, so3
-from lslam.core.types.arrays import Floats
+from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.imu import ImuStream
 from lslam.simulation.kinematics import Kinematics, Motion
 
@@ -130,11 +130,17 @@ IMUS = {
 }
 
 
-def imu_named(name: str) -> ImuModel:
+def find_imu(name: str) -> ImuModel:
     """Model called `name`. Raises UsageError with the nearest name."""
     if name not in IMUS:
         raise UsageError(f"no IMU {name!r}; {nearest(name, IMUS)}")
     return IMUS[name]
+
+
+def reading_stamps(rate_hz: float, end: float) -> Longs:
+    """(M,) ns, nominal stamps of a sensor's readings from 0 to `end` s."""
+    count = int(np.floor(end * rate_hz + 1e-6)) + 1
+    return np.round(np.arange(count) * (1e9 / rate_hz)).astype(np.int64)
 
 
 def simulate_imu(
@@ -144,12 +150,12 @@ def simulate_imu(
 
     The same generator state gives the same readings; a longer `end` only adds to them.
     """
-    count = int(np.floor(end * model.rate_hz + 1e-6)) + 1
-    stamps = np.round(np.arange(count) * (1e9 / model.rate_hz)).astype(np.int64)
-    truth = felt = motion.at(stamps / 1e9).carried(T_lidar_imu)
+    stamps = reading_stamps(model.rate_hz, end)
+    count = len(stamps)
+    truth = felt = motion.at(stamps / 1e9).at_sensor(T_lidar_imu)
     if model.late > 0:
         taken = stamps / 1e9 + model.late * rng.spawn(1)[0].standard_normal(count)
-        felt = motion.at(np.clip(taken, 0.0, motion.duration)).carried(T_lidar_imu)
+        felt = motion.at(np.clip(taken, 0.0, motion.duration)).at_sensor(T_lidar_imu)
     noise = rng.standard_normal((count, 4, 3))
     accel, accel_bias = measure(model.accel, specific_force(felt), noise[:, :2], model.rate_hz)
     gyro, gyro_bias = measure(model.gyro, felt.rate, noise[:, 2:], model.rate_hz)

@@ -7,9 +7,8 @@ import numpy as np
 from lslam.core.geometry import portable
 from lslam.core.types.arrays import Floats
 from lslam.simulation.city import City
-from lslam.simulation.curve import RouteCurve, rounded_rectangle, smooth_curve
+from lslam.simulation.curve import RouteCurve, Terrain, rounded_rectangle, smooth_curve
 from lslam.simulation.scene_mesh import MeshBuilder, Surface
-from lslam.simulation.terrain import Terrain
 
 HALL_SIDE_M = 12.0  # m from the middle line to the walls
 END = 1.0  # m that the hall is longer than its line at either end

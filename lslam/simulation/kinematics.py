@@ -51,7 +51,7 @@ class Kinematics:
     rate: Floats
     rate_change: Floats
 
-    def carried(self, T_body_sensor: NDArray[Any]) -> Kinematics:
+    def at_sensor(self, T_body_sensor: NDArray[Any]) -> Kinematics:
         """Motion of a sensor fixed to the body at `T_body_sensor` (4, 4), with the effect of the lever arm."""
         R_body_sensor, arm = np.asarray(T_body_sensor)[:3, :3], np.asarray(T_body_sensor)[:3, 3]
         R = self.poses[:, :3, :3]
@@ -170,7 +170,7 @@ class Vibration(Section):
     band_hz: tuple[float, float] = (8.0, 25.0)
 
     @model_validator(mode="after")
-    def _band_is_ordered(self) -> Vibration:
+    def _check_band(self) -> Vibration:
         low, high = self.band_hz
         if not 0 < low <= high <= 500:
             raise ValueError(f"vibration.band_hz = [{low:g}, {high:g}], expected two numbers up to 500, in order")
@@ -190,7 +190,7 @@ class Shaking:
         angle = 2 * np.pi * np.asarray(times)[:, None, None] * self.frequencies + self.phases
         return np.asarray(portable.sin(angle).sum(axis=2) * self.amplitudes)
 
-    def shaken(self, poses: NDArray[Any], times: NDArray[Any]) -> Floats:
+    def shake(self, poses: NDArray[Any], times: NDArray[Any]) -> Floats:
         """Poses (M, 4, 4) at `times` (M,), s, of a vibrating LiDAR, from poses without vibration, (M, 4, 4) or one (4, 4)."""
         off = self.at(times)
         lift = np.column_stack([np.zeros((len(off), 2)), off[:, 3]])

@@ -14,52 +14,14 @@ from lslam.core.labels import CLASSES
 from lslam.core.types.arrays import Bools, Floats
 from lslam.core.types.scan import Scan
 from lslam.simulation.lidar_models import LidarModel
-from lslam.simulation.returns import Errors, Hits, Rays, Returns, errors, mirrored, penetrate, range_walk, reflect
-from lslam.simulation.scene_mesh import RayScene, Surface, is_glass
+from lslam.simulation.returns import Errors, Hits, Rays, Returns, errors, mirror_indices, penetrate, range_walk, reflect
+from lslam.simulation.scene_mesh import LOOKS, RayScene, Surface, is_glass
 
-# Share of the light of a 905 nm laser that comes back from each surface met squarely.
-REFLECTIVITY = np.zeros(len(Surface), np.float32)
-for _surface, _share in {
-    Surface.ROAD: 0.35,
-    Surface.PAVEMENT: 0.40,
-    Surface.LAWN: 0.45,
-    Surface.WALL: 0.45,
-    Surface.GLASS: 0.03,
-    Surface.PANE: 0.03,
-    Surface.ROOF: 0.25,
-    Surface.FOLIAGE: 0.45,
-    Surface.TRUNK: 0.30,
-    Surface.POLE: 0.40,
-    Surface.CAR: 0.35,
-    Surface.FENCE: 0.35,
-    Surface.PERSON: 0.35,
-    Surface.CROWN: 0.45,
-    Surface.HEDGE: 0.45,
-}.items():
-    REFLECTIVITY[_surface] = _share
+REFLECTIVITY = np.array([LOOKS[surface].reflectivity for surface in Surface], np.float32)
 # Class of each surface, where it stands and where it moves.
-LABELS = np.zeros((2, len(Surface)), np.uint16)
-for _surface, _name in {
-    Surface.ROAD: "road",
-    Surface.PAVEMENT: "sidewalk",
-    Surface.LAWN: "terrain",
-    Surface.WALL: "building",
-    Surface.GLASS: "building",
-    Surface.PANE: "car",
-    Surface.ROOF: "building",
-    Surface.FOLIAGE: "vegetation",
-    Surface.TRUNK: "trunk",
-    Surface.POLE: "pole",
-    Surface.CAR: "car",
-    Surface.FENCE: "fence",
-    Surface.PERSON: "person",
-    Surface.CROWN: "vegetation",
-    Surface.HEDGE: "vegetation",
-}.items():
-    LABELS[0, _surface] = CLASSES[_name]
-LABELS[1, [Surface.CAR, Surface.PANE, Surface.PERSON]] = [
-    CLASSES[f"moving-{_name}"] for _name in ("car", "car", "person")
-]
+LABELS = np.array([[CLASSES[LOOKS[surface].label] for surface in Surface], [0] * len(Surface)], np.uint16)
+for _surface in (Surface.CAR, Surface.PANE, Surface.PERSON):
+    LABELS[1, _surface] = CLASSES[f"moving-{LOOKS[_surface].label}"]
 # Light that a rough surface, its facets tilted by 0.6 rad, sends back where it came from: A cos + B sin^2 of the incidence
 # (Oren and Nayar 1994). KITTI's intensities of roads hardly fall from 4 m to 20 m, as they would by the cosine alone.
 ROUGH_A, ROUGH_B = 1 - 0.5 * 0.36 / (0.36 + 0.33), 0.45 * 0.36 / (0.36 + 0.09)
@@ -117,7 +79,7 @@ def trace(
     glass: float = 0.0,
     roof: Roof | None = None,
     returns: Returns | None = None,
-    compensated: bool | None = None,
+    has_one_instant: bool | None = None,
 ) -> Scan:
     """Simulate one scan of `model`.
 
@@ -130,7 +92,7 @@ def trace(
     glass : share of the rays on a pane that pass it and go on to what is behind
     roof : of the vehicle that carries the LiDAR, which is in the way of the ground
     returns : what real surfaces and beams add; None for clean, sharp ones
-    compensated : whether all rays are fired at `stamp_ns`, whatever the poses; None: when there is one pose
+    has_one_instant : whether all rays are fired at `stamp_ns`, whatever the poses; None: when there is one pose
 
     Returns ------- The measured points, with intensity 0..1 in steps of 0.01, rings, classes and, for distorted scans, times.
     """
@@ -138,7 +100,7 @@ def trace(
     extra = rng.spawn(1)[0] if returns is not None else rng
     directions, true = _directions(model, rng, index, period)
     poses = np.asarray(T_city_lidar, np.float64)
-    moving = poses.ndim == 3 if compensated is None else not compensated
+    moving = poses.ndim == 3 if has_one_instant is None else not has_one_instant
     column, ring = np.divmod(np.arange(model.rays), model.rings)
     since = column * (period / model.columns) + model.firing[ring] if moving else np.zeros(model.rays)
     rays = _into_city(model, true, poses, period, stamp_ns / 1e9 + since)
@@ -186,10 +148,10 @@ class Meeting:
 def _meet_bodies(bodies: Sequence[MovingMesh], rays: Rays, rings: int, hits: Hits, stamp: float) -> None:
     """Replace `hits` by hits on moving bodies where these are nearer; `stamp`, s, is that of the bodies' centres."""
     centres = np.stack([body.centre for body in bodies])
-    lasting = float(rays.fired.max()) - stamp
+    lasting = float(rays.times.max()) - stamp
     # Body and LiDAR both move while the sweep lasts; a millimetre for the rounding.
-    swept = np.array([body.radius + 1e-3 + body.speed * lasting for body in bodies])
-    candidates = _by_column(centres, swept, rays, rings) if rings > 1 else _by_ray(centres, swept, rays, hits)
+    radii = np.array([body.radius + 1e-3 + body.speed * lasting for body in bodies])
+    candidates = _by_column(centres, radii, rays, rings) if rings > 1 else _by_ray(centres, radii, rays, hits)
     for body, near in zip(bodies, candidates, strict=True):
         if not len(near):
             continue
@@ -197,28 +159,28 @@ def _meet_bodies(bodies: Sequence[MovingMesh], rays: Rays, rings: int, hits: Hit
         along = np.einsum("ij,ij->i", to, rays.directions[near])
         aside = np.einsum("ij,ij->i", to, to) - along**2
         # Each ray knows where it starts and when.
-        reached = (body.radius + 1e-3 + body.speed * (rays.fired[near] - stamp)).astype(np.float32)
+        reached = (body.radius + 1e-3 + body.speed * (rays.times[near] - stamp)).astype(np.float32)
         near = near[(along > -reached) & (aside < reached**2) & (along < hits.distance[near] + reached)]
         if len(near):
             _meet_body(body, near, rays[near], hits, stamp)
 
 
-def _by_column(centres: Floats, swept: Floats, rays: Rays, rings: int) -> Iterator[NDArray[np.intp]]:
-    """For each body, the rays of a scan that may hit it: those within `swept` (B,), m, of its centre (B, 3)."""
+def _by_column(centres: Floats, radii: Floats, rays: Rays, rings: int) -> Iterator[NDArray[np.intp]]:
+    """For each body, the rays of a scan that may hit it: those within `radii` (B,), m, of its centre (B, 3)."""
     # Bearings of whole columns first: a body is met by few of them, and then by few of their rings.
     bearing = portable.arctan2(rays.directions[:, 1], rays.directions[:, 0]).reshape(-1, rings)
     middle = bearing[:, rings // 2]
     spread = np.abs(_wrap_angle(bearing - middle[:, None])).max(axis=1)
     climb = rays.directions[:, 2].reshape(-1, rings)
     apart = sum(float(np.ptp(axis)) for axis in rays.origins.T)
-    to = centres - rays.origins[len(rays.fired) // 2]
-    reach, level, away = swept + apart, portable.hypot(to[:, 0], to[:, 1]), portable.norm(to)
+    to = centres - rays.origins[len(rays.times) // 2]
+    reach, level, away = radii + apart, portable.hypot(to[:, 0], to[:, 1]), portable.norm(to)
     aside = portable.arcsin(reach / np.maximum(level, reach))
     rise, tilt = portable.arctan2(to[:, 2], level), portable.arcsin(reach / np.maximum(away, reach)) + 1e-3
     lowest, highest = (portable.sin(np.clip(rise + k * tilt, -np.pi / 2, np.pi / 2)) for k in (-1, 1))
     for i, towards in enumerate(portable.arctan2(to[:, 1], to[:, 0]).astype(np.float32)):
         if level[i] <= reach[i]:
-            yield np.arange(len(rays.fired))
+            yield np.arange(len(rays.times))
             continue
         columns = np.flatnonzero(np.abs(_wrap_angle(middle - towards)) <= aside[i] + spread)
         upright = climb[columns]
@@ -226,12 +188,12 @@ def _by_column(centres: Floats, swept: Floats, rays: Rays, rings: int) -> Iterat
         yield columns[at] * rings + ring
 
 
-def _by_ray(centres: Floats, swept: Floats, rays: Rays, hits: Hits) -> Iterator[NDArray[np.intp]]:
+def _by_ray(centres: Floats, radii: Floats, rays: Rays, hits: Hits) -> Iterator[NDArray[np.intp]]:
     """As `_by_column`, for rays that start anywhere."""
     # Relative to their middle single precision is good for centimetres, which `reach` allows.
     middle = rays.origins.mean(axis=0, dtype=np.float64)
     start, at = (rays.origins - middle).astype(np.float32), (centres - middle).astype(np.float32)
-    reach = swept.astype(np.float32)[:, None] + np.float32(0.05)
+    reach = radii.astype(np.float32)[:, None] + np.float32(0.05)
     # No matrix product: BLAS would wake its threads for three columns.
     along = np.einsum("bi,ni->bn", at, rays.directions)
     along -= np.einsum("ij,ij->i", start, rays.directions)
@@ -247,7 +209,7 @@ def _by_ray(centres: Floats, swept: Floats, rays: Rays, hits: Hits) -> Iterator[
 def _meet_body(body: MovingMesh, which: NDArray[np.intp], rays: Rays, hits: Hits, stamp: float) -> None:
     """Intersect the rays `which` with a body at its place when each of them is fired."""
     # Between instants of a few milliseconds it moves on evenly, to micrometres; they do not hang on which rays are tried.
-    share = (rays.fired - stamp) / BODY_STEP
+    share = (rays.times - stamp) / BODY_STEP
     at = share.astype(np.intp)
     first = int(at.min())
     T = body.poses(stamp + BODY_STEP * np.arange(first, int(at.max()) + 2))
@@ -287,7 +249,7 @@ def _leave_panes(meeting: Meeting, rays: Rays, hits: Hits, lucky: Bools, returns
     """
     off = np.zeros(0, np.intp)
     if returns is not None and returns.mirror > 0:
-        off = mirrored(returns, hits, meeting.scene.mesh.normals, meeting.rng)
+        off = mirror_indices(returns, hits, meeting.scene.mesh.normals, meeting.rng)
     if len(lucky):
         lucky[off] = False
     through = np.flatnonzero(lucky & is_glass(hits.surface) & np.isfinite(hits.distance)) if len(lucky) else off[:0]
@@ -332,7 +294,7 @@ def _into_city(
     directions: NDArray[np.float32],
     poses: Floats,
     period: float,
-    fired: Floats,
+    times: Floats,
 ) -> Rays:
     """Rays (N, 3) from the LiDAR's frame to the city frame, by one pose (4, 4) or a pose (columns, 4, 4) per column."""
     by_column = directions.reshape(model.columns, model.rings, 3)
@@ -347,7 +309,7 @@ def _into_city(
         origins = origins + share * step_t[:, None]
         towards = towards + share * portable.product(by_column, np.swapaxes(step_R, -1, -2))
     spread = np.broadcast_to(origins, by_column.shape)
-    return Rays(spread.reshape(-1, 3), towards.reshape(-1, 3), fired)
+    return Rays(spread.reshape(-1, 3), towards.reshape(-1, 3), times)
 
 
 def _on(steps: Floats) -> NDArray[np.float32]:

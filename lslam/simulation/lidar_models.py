@@ -212,7 +212,7 @@ class LidarMount(Section):
         return se3.make(so3.from_euler_rpy(np.radians(self.rpy_deg)), np.array(self.place))
 
 
-def lidar_named(name: str) -> LidarModel:
+def find_lidar(name: str) -> LidarModel:
     """Model called `name`. Raises UsageError naming the nearest one."""
     if name not in LIDARS:
         raise UsageError(f"no LiDAR {name!r}; {nearest(name, LIDARS)}")

@@ -13,10 +13,10 @@ from lslam.core.geometry import portable, se3
 from lslam.core.types.arrays import Floats
 from lslam.simulation import furniture
 from lslam.simulation.city import KERB
-from lslam.simulation.curve import RouteCurve
+from lslam.simulation.curve import RouteCurve, Terrain
 from lslam.simulation.lidar import MovingMesh
+from lslam.simulation.scenario_files import TrafficSection
 from lslam.simulation.scene_mesh import MeshBuilder, RayScene, SceneMesh, Surface, tube
-from lslam.simulation.terrain import Terrain
 
 MODELS = 6  # different cars and different people
 BUS = (11.0, 2.5, 3.3)  # m
@@ -70,30 +70,23 @@ def add_traffic(
     line: Callable[[NDArray[Any]], Floats],
     duration: float,
     rng: np.random.Generator,
-    *,
-    cars_per_km: float,
-    people_per_km: float,
-    lanes: tuple[float, ...],
+    traffic: TrafficSection,
     pavement: float,
-    speed: float,
 ) -> list[Mover]:
     """Cars and pedestrians on `streets`; none comes within `NEAREST_M` m of the LiDAR's `line`.
 
-    Parameters
-    ----------
-    line : (M, 4, 4) T_city_lidar at times (M,), s, from 0 to `duration`
-    lanes : offsets of the lanes, m to the left of the middle; a car in a lane on the left comes towards us
-    pavement : offset of the pedestrians, m, on either side; speed : mean of the cars, m/s
+    line : (M, 4, 4) T_city_lidar at times (M,), s, from 0 to `duration`; pavement : offset of pedestrians, m, on either side
     """
-    cars = [RayScene(furniture.parked_car(rng)) for _ in range(MODELS if cars_per_km else 0)]
-    people = [RayScene(pedestrian(rng)) for _ in range(MODELS if people_per_km else 0)]
+    cars = [RayScene(furniture.parked_car(rng)) for _ in range(MODELS if traffic.cars else 0)]
+    people = [RayScene(pedestrian(rng)) for _ in range(MODELS if traffic.people else 0)]
     times = np.arange(0.0, duration, 0.1)
     ego = line(times)
     movers = []
     for street in streets:
-        for kind, density in ((cars, cars_per_km), (people, people_per_km)):
-            for _ in range(int(rng.poisson(density * street.length / 1000))):
-                body = _body(kind, kind is cars, street, terrain, rng, lanes, pavement, speed)
+        for kind, per_km in ((cars, traffic.cars), (people, traffic.people)):
+            for _ in range(int(rng.poisson(per_km * street.length / 1000))):
+                scene = kind[int(rng.integers(len(kind)))]
+                body = _body(scene, kind is cars, street, terrain, rng, traffic, pavement)
                 if _keeps_clear(body, times, ego):
                     movers.append(body)
     return movers
@@ -192,21 +185,19 @@ def _cross(a: Floats, b: Floats) -> Floats:
 
 
 def _body(
-    kind: list[RayScene],
+    scene: RayScene,
     is_car: bool,
     street: RouteCurve,
     terrain: Terrain,
     rng: np.random.Generator,
-    lanes: tuple[float, ...],
+    traffic: TrafficSection,
     pavement: float,
-    speed: float,
 ) -> Mover:
-    scene = kind[int(rng.integers(len(kind)))]
     radius = float(np.linalg.norm(scene.mesh.vertices, axis=1).max())
     begin = rng.uniform(0, street.length)
     if is_car:
-        lane = lanes[int(rng.integers(len(lanes)))]
-        pace = speed * rng.uniform(0.8, 1.15) * (-1 if lane > 0 else 1)
+        lane = traffic.lanes[int(rng.integers(len(traffic.lanes)))]
+        pace = traffic.speed * rng.uniform(0.8, 1.15) * (-1 if lane > 0 else 1)
         return Mover(scene, radius, street, terrain, begin, pace, lane)
     side, pace = (1 if rng.random() < 0.5 else -1), rng.uniform(1.0, 1.7) * (1 if rng.random() < 0.5 else -1)
     return Mover(scene, radius, street, terrain, begin, pace, side * (pavement + rng.uniform(-0.2, 0.2)), KERB)

@@ -12,11 +12,20 @@ from lslam.core.errors import InputError
 from lslam.core.geometry import portable
 from lslam.core.types.arrays import Floats
 from lslam.core.types.building import Building, Footprint, footprint_polygon, is_canopy
-from lslam.simulation.city import KERB, MARGIN_M, City, Layout, Lots, add_garden_trees, add_street_furniture
-from lslam.simulation.curve import RouteCurve
-from lslam.simulation.scene_mesh import MeshBuilder, Surface, grid_faces
-from lslam.simulation.terrain import Terrain
-from lslam.simulation.town import CAR_LENGTH, Network, Places, add_road
+from lslam.simulation.city import (
+    KERB,
+    MARGIN_M,
+    City,
+    Layout,
+    Lots,
+    Site,
+    add_garden_trees,
+    add_road,
+    add_street_furniture,
+)
+from lslam.simulation.curve import RouteCurve, Terrain
+from lslam.simulation.scene_mesh import MeshBuilder, Surface
+from lslam.simulation.town import CAR_LENGTH, Network, Places
 
 GROUND_CELL_M = 1.0  # m, of the ground
 MOST_CELLS = 1_500_000
@@ -68,7 +77,7 @@ def build_osm_city(
     _add_ground(builder, built, terrain, network, layout.band, rng)
     outlines = [(footprint.outer, building.height or 0.0) for building in built for footprint in building.footprints]
     if network is not None:
-        _furnish(builder, network, outlines, terrain, layout, rng)
+        _furnish(Site(builder, roads[0], terrain, layout, rng), network, outlines)
     return OsmCity(
         builder.build(),
         terrain,
@@ -118,29 +127,22 @@ def _add_ground(
     if network is not None:
         # No hole is cut, so that no ray falls through where the strips of two roads meet at an angle.
         z += KERB - BESIDE_KERB - UNDER_ROAD * (network.distance(xy) < band - 0.3)
-    vertices = np.concatenate([xy, z[..., None]], -1).reshape(-1, 3)
-    builder.add(vertices, grid_faces(len(x), len(y)), Surface.LAWN)
+    builder.add_grid(xy, z, Surface.LAWN)
 
 
-def _furnish(
-    builder: MeshBuilder,
-    network: Network,
-    outlines: list[tuple[Floats, float]],
-    terrain: Terrain,
-    layout: Layout,
-    rng: np.random.Generator,
-) -> None:
+def _furnish(site: Site, network: Network, outlines: list[tuple[Floats, float]]) -> None:
     """Add roads with kerbs, and beside them cars, trees, poles and bins wherever no building is in the way."""
-    for street in network.streets:
-        add_road(builder, street, network, terrain, layout, rng)
-    allowed = _Gaps(network, layout, [outer for outer, _ in outlines])
-    for street in network.streets:
+    sites = [site.along(street) for street in network.streets]
+    for road in sites:
+        add_road(road, network.distance)
+    is_free = _Gaps(network, site.layout, [outer for outer, _ in outlines])
+    for road in sites:
         for side in (1, -1):
-            add_street_furniture(builder, street, terrain, layout, rng, side, allowed)
-    lots = Lots(network.streets, layout)
+            add_street_furniture(road, side, is_free)
+    lots = Lots(network.streets, site.layout)
     for outer, height in outlines:
         lots.take(outer, height)
-    add_garden_trees(builder, lots, terrain, layout, rng)
+    add_garden_trees(site, lots)
 
 
 class _Gaps:

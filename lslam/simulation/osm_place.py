@@ -19,12 +19,11 @@ from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.building import Building, footprint_polygon, is_canopy
 from lslam.io.formats.osm_buildings import BuildingExtract, distance_text, is_underground, read_buildings, right_place
 from lslam.io.formats.osm_data import OsmData
-from lslam.simulation.curve import RouteCurve, smooth_curve
+from lslam.simulation.curve import RouteCurve, Terrain, smooth_curve
 from lslam.simulation.moving import Mover
 from lslam.simulation.osm_city import OsmCity, build_osm_city
 from lslam.simulation.routes import TIGHTEST, Route, WayPoints, beside, given_route
 from lslam.simulation.scenario_files import Scenario
-from lslam.simulation.terrain import Terrain
 
 log = logging.getLogger("lslam")
 
@@ -94,7 +93,7 @@ def route_in_map(scenario: Scenario, extract: MapExtract, way_points: WayPoints 
     buildings, margin = extract.buildings.buildings, scenario.path.lane + ELBOW_ROOM
     if way_points is None:
         return _along_streets(scenario, extract, margin)
-    if not way_points.is_placed:
+    if not way_points.has_place:
         way_points = fit_shape(way_points, buildings, margin, extract.buildings.source)
     return given_route(scenario, way_points)
 
@@ -103,10 +102,10 @@ def city_of_map(
     scenario: Scenario, extract: MapExtract, terrain: Terrain, rng: np.random.Generator, route: Route | None
 ) -> OsmCity:
     """City within 150 m of `route`, or of the whole extract. Raises InputError when no building is that near."""
-    found, layout, flies = extract.buildings, scenario.layout, scenario.carrier == "drone"
-    buildings = found.buildings
+    whole, layout, flies = extract.buildings, scenario.layout, scenario.carrier == "drone"
+    buildings = whole.buildings
     if route is not None:
-        buildings = buildings_near(found, route.line.position(route.line.sample(5.0)), VISIBLE_M)
+        buildings = buildings_near(whole, route.line.position(route.line.sample(5.0)), VISIBLE_M)
     # Below a flight there are only the roads of the map: it may pass over anything.
     driven = [] if route is None or flies else [route.street]
     roads = side_roads(
@@ -117,7 +116,7 @@ def city_of_map(
         SIDE_ROADS,
     )
     return build_osm_city(
-        buildings, terrain, rng, [*driven, *roads], layout, found.attribution, Path(found.source).name
+        buildings, terrain, rng, [*driven, *roads], layout, whole.attribution, Path(whole.source).name
     )
 
 
@@ -158,13 +157,13 @@ def _along_streets(scenario: Scenario, extract: MapExtract, margin: float) -> Ro
         radius = max(radius, 1.1 * scenario.speed**2 / scenario.lateral + lane)
     source = extract.buildings.source
     ways = highways(extract.data, extract.origin, kinds)
-    found = find_route(ways, extract.buildings.buildings, margin, radius)
-    if found is None:
+    line = find_route(ways, extract.buildings.buildings, margin, radius)
+    if line is None:
         raise UsageError(
             f"{source} has {'no street' if not ways else 'no 50 m of street clear of walls'} to go along: give --path FILE "
             f"with way-points; --osm {source} --plan map.png without --path draws the place to read them from"
         )
-    street = smooth_curve(found, closed=False)
+    street = smooth_curve(line, closed=False)
     log.info("going along %.0f m of the streets of %s: --path FILE takes another line", street.length, source)
     return Route(street, beside(street, -lane))
 
@@ -194,7 +193,7 @@ def fit_shape(shape: WayPoints, buildings: Sequence[Building], margin: float, so
     turn = np.degrees(portable.arctan2(R[1, 0], R[0, 0]))
     x, y = portable.rotate(R, points[0]) + shift
     log.info("the shape of --path begins at x = %.0f, y = %.0f m, turned by %.0f deg", x, y, turn)
-    return replace(shape, points=portable.product(shape.points[:, :2], R.T) + shift, is_placed=True)
+    return replace(shape, points=portable.product(shape.points[:, :2], R.T) + shift, has_place=True)
 
 
 def _dense(shape: WayPoints) -> Floats:

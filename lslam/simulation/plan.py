@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from lslam.core.types.arrays import Floats, Longs
 from lslam.simulation.city import City
-from lslam.simulation.scene_mesh import RayScene, Surface
+from lslam.simulation.scene_mesh import LOOKS, RayScene, Surface
 
 Image = NDArray[np.uint8]
 
@@ -20,25 +20,7 @@ FINE, COARSE = 10, 50  # m between the lines of the grid
 PATH = (214, 30, 40)
 SKY = 1000.0  # m, whence the view is taken
 
-COLOURS = np.full((len(Surface), 3), 128, np.uint8)
-for _surface, _colour in {
-    Surface.ROAD: (96, 96, 100),
-    Surface.PAVEMENT: (168, 166, 160),
-    Surface.LAWN: (206, 220, 184),
-    Surface.WALL: (182, 120, 96),
-    Surface.GLASS: (120, 160, 176),
-    Surface.PANE: (124, 150, 170),
-    Surface.ROOF: (168, 92, 74),
-    Surface.FOLIAGE: (88, 136, 70),
-    Surface.TRUNK: (104, 78, 54),
-    Surface.POLE: (20, 20, 20),
-    Surface.CAR: (50, 76, 150),
-    Surface.FENCE: (90, 80, 70),
-    Surface.PERSON: (200, 0, 160),
-    Surface.CROWN: (80, 130, 64),
-    Surface.HEDGE: (68, 118, 54),
-}.items():
-    COLOURS[_surface] = _colour
+COLOURS = np.array([LOOKS[surface].plan_colour for surface in Surface], np.uint8)
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ from lslam.io.formats.kitti_layout import (
     write_times,
 )
 from lslam.io.formats.sequence_toml import FILE_NAME, SequenceInfo, write_sequence_toml
-from lslam.io.formats.trajectory_files import write_kitti
+from lslam.io.formats.trajectory_lines import write_kitti
 from lslam.simulation import NUMBER, check_target, part_of
 from lslam.simulation.camera import NAME as CAMERA
 from lslam.simulation.camera import SimulatedCamera, write_images
@@ -76,12 +76,7 @@ def describe_drive(drive: SimulatedDrive) -> dict[str, Any]:
         "status": "done",
         "lslam": __version__,
         "name": drive.name,
-        "scenario": drive.scenario.model_dump(mode="json"),
-        "seed": drive.seed,
-        "visit": asdict(drive.visit),
-        "lidar": asdict(drive.lidar),
-        **_further(drive),
-        "scans": len(drive),
+        **_parameters(drive),
         "rate_hz": drive.rate_hz,
         "motion_compensated": drive.motion_compensated,
         "length_m": round(float(truth.path_lengths[-1]), 3),
@@ -107,9 +102,18 @@ def describe_drive(drive: SimulatedDrive) -> dict[str, Any]:
     }
 
 
-def _further(drive: SimulatedDrive) -> dict[str, Any]:
+def _parameters(drive: SimulatedDrive) -> dict[str, Any]:
+    """What the scans of a drive follow from."""
     mounts = zip(drive.scenario.lidars, drive.further, strict=True)
-    return {"further_lidars": {mount.name: asdict(other.lidar) for mount, other in mounts}} if drive.further else {}
+    further = {mount.name: asdict(other.lidar) for mount, other in mounts}
+    return {
+        "scenario": drive.scenario.model_dump(mode="json"),
+        "seed": drive.seed,
+        "visit": asdict(drive.visit),
+        "lidar": asdict(drive.lidar),
+        **({"further_lidars": further} if further else {}),
+        "scans": len(drive),
+    }
 
 
 def _plain(value: Any) -> Any:
@@ -127,17 +131,8 @@ def _plain(value: Any) -> Any:
 
 def fingerprint(drive: SimulatedDrive) -> str:
     """Digest of all parameters of a recording; an unfinished one can be resumed only with the same digest."""
-    said = {
-        "version": __version__,
-        "scenario": drive.scenario.model_dump(mode="json"),
-        "lidar": asdict(drive.lidar),
-        **_further(drive),
-        "seed": drive.seed,
-        "visit": asdict(drive.visit),
-        "scans": len(drive),
-        "compensated": drive.motion_compensated,
-    }
-    digest = hashlib.sha256(json.dumps(said, sort_keys=True).encode())
+    tree = {"version": __version__, **_parameters(drive), "compensated": drive.motion_compensated}
+    digest = hashlib.sha256(json.dumps(tree, sort_keys=True).encode())
     digest.update(drive.city.mesh.vertices.tobytes())
     digest.update(drive.vehicle.poses(drive.stamps_ns / 1e9).tobytes())
     return digest.hexdigest()
@@ -165,11 +160,11 @@ def lidars_of(drive: SimulatedDrive, folder: Path) -> list[tuple[SimulatedDrive,
 
 
 def write_scans(
-    drive: SimulatedDrive, folder: Path, on_scan: Callable[[int], None] | None = None, is_labelled: bool = False
+    drive: SimulatedDrive, folder: Path, on_scan: Callable[[int], None] | None = None, has_labels: bool = False
 ) -> int:
     """Write the scans missing in `folder` as KITTI's .bin with times and rings beside. Returns the number of points of all.
 
-    is_labelled : with the classes of points
+    has_labels : with the classes of points
     `on_scan` is called with the index of every scan, in order, once the scans of all LiDARs are on disk.
     """
     jobs = [
@@ -180,7 +175,7 @@ def write_scans(
     ]
 
     def is_there(place: Path, index: int) -> bool:
-        return scan_files(place, index)[1].is_file() and (not is_labelled or label_file(place, index).is_file())
+        return scan_files(place, index)[1].is_file() and (not has_labels or label_file(place, index).is_file())
 
     fresh = _trace_scans([(lidar, index) for lidar, index, place in jobs if not is_there(place, index)])
     total = 0
@@ -192,8 +187,7 @@ def write_scans(
             total += len(scan)
             # All rays of a compensated scan were fired at its stamp.
             times = np.zeros(len(scan), np.float32) if scan.times is None else scan.times
-            labels = scan.labels if is_labelled else None
-            write_scan(place, index, scan.points, scan.intensity, times, scan.rings, labels)
+            write_scan(place, index, replace(scan, times=times, labels=scan.labels if has_labels else None))
         if on_scan is not None and (following is None or following[1] != index):
             on_scan(index)
     return total
@@ -215,7 +209,7 @@ def _trace_scans(jobs: Iterable[tuple[SimulatedDrive, int]]) -> Iterator[Scan]:
 
 
 @dataclass(frozen=True)
-class Recorded:
+class RecordingResult:
     """Result of `record`: the sequence folder, its poses, numbers of points and bytes."""
 
     sequence: Path
@@ -231,14 +225,14 @@ def record(
     on_scan: Callable[[int], None] | None = None,
     resume: bool = False,
     command: str = "",
-    is_labelled: bool = False,
+    has_labels: bool = False,
     on_image: Callable[[int], None] | None = None,
-) -> Recorded:
+) -> RecordingResult:
     """Trace all scans of `drive` and write `out`/sequences/00 and `out`/poses/00.txt.
 
     The poses are of camera 0, as KITTI's; everything else in `out` is left alone. `on_scan` is called after each scan. What
     is interrupted keeps its scans in `sequences/00.part`, and `resume` goes on there with the same bytes. Last comes the
-    sequence's `manifest.json`, with `command`, what was typed. `is_labelled` adds the class of every point; `on_image` the images
+    sequence's `manifest.json`, with `command`, what was typed. `has_labels` adds the class of every point; `on_image` the images
     of a camera, and is called after each.
 
     Raises
@@ -261,7 +255,7 @@ def record(
             folder.mkdir(parents=True, exist_ok=True)
         _check_space(out, part, drive)
         write_mark(part, drive)
-        points = write_scans(drive, part, on_scan, is_labelled)
+        points = write_scans(drive, part, on_scan, has_labels)
         camera = None if on_image is None else SimulatedCamera(drive)
         if camera is not None and on_image is not None:
             for k in write_images(camera, part):
@@ -283,7 +277,7 @@ def record(
             _keep_what_is_worth_it(out, part)
     size = poses.stat().st_size + sum(file.stat().st_size for file in sequence.rglob("*") if file.is_file())
     write_manifest(sequence, drive, command, points, size)
-    return Recorded(sequence, poses, points, size)
+    return RecordingResult(sequence, poses, points, size)
 
 
 def _check_space(out: Path, part: Path, drive: SimulatedDrive) -> None:

@@ -42,22 +42,22 @@ class Rays:
 
     origins: NDArray[np.float32]
     directions: NDArray[np.float32]
-    fired: Floats
+    times: Floats
 
     def __getitem__(self, which: NDArray[np.intp]) -> Rays:
-        return Rays(self.origins[which], self.directions[which], self.fired[which])
+        return Rays(self.origins[which], self.directions[which], self.times[which])
 
     def with_more(self, others: Rays) -> Rays:
         """These rays, followed by `others`."""
         return Rays(
             np.concatenate([self.origins, others.origins]),
             np.concatenate([self.directions, others.directions]),
-            np.concatenate([self.fired, others.fired]),
+            np.concatenate([self.times, others.times]),
         )
 
     def after(self, distance: NDArray[np.float32]) -> Rays:
         """Rays that start `distance` (N,), m, further on."""
-        return Rays(self.origins + distance[:, None] * self.directions, self.directions, self.fired)
+        return Rays(self.origins + distance[:, None] * self.directions, self.directions, self.times)
 
 
 @dataclass(frozen=True)
@@ -212,7 +212,7 @@ def errors(returns: Returns, model: LidarModel, rays: Rays, hits: Hits, rng: np.
             place = (rays.origins[met] + distance[met, None] * rays.directions[met]).astype(np.float32)
             late[met] += np.float32(deviation) * texture(place) / cosine[met]
     if returns.divergence_mrad > 0 and returns.pulse > 0:
-        late += mixed(returns, model, hits.distance, slant, rng)
+        late += mixed_pixels(returns, model, hits.distance, slant, rng)
     return Errors(late, _gain(returns, hits, distance))
 
 
@@ -235,7 +235,7 @@ def _bumps() -> Array:
     return np.random.default_rng(_TABLE).standard_normal(_TABLE, np.float32)
 
 
-def mixed(returns: Returns, model: LidarModel, distance: Array, slant: Array, rng: np.random.Generator) -> Array:
+def mixed_pixels(returns: Returns, model: LidarModel, distance: Array, slant: Array, rng: np.random.Generator) -> Array:
     """(N,) range error, m, of beams that straddle an edge.
 
     An edge somewhere between two columns is within the spot of one of the two rays beside it with the probability of the
@@ -260,7 +260,7 @@ def mixed(returns: Returns, model: LidarModel, distance: Array, slant: Array, rn
     return out.ravel()
 
 
-def mirrored(returns: Returns, hits: Hits, normals: Array, rng: np.random.Generator) -> NDArray[np.intp]:
+def mirror_indices(returns: Returns, hits: Hits, normals: Array, rng: np.random.Generator) -> NDArray[np.intp]:
     """Indices of the rays that a pane of the static scene mirrors; `normals` (F, 3) of its faces."""
     panes = np.flatnonzero(is_glass(hits.surface) & np.isfinite(hits.distance) & (hits.face >= 0))
     share = returns.mirror + (1 - returns.mirror) * portable.power(1 - hits.cosine[panes], 5)
@@ -273,7 +273,7 @@ def reflect(rays: Rays, distance: Array, normals: Array) -> Rays:
     """Rays (N,) reflected at `distance` (N,), m, by faces with `normals` (N, 3)."""
     along = np.einsum("ij,ij->i", rays.directions, normals)
     directions = rays.directions - 2 * along[:, None] * normals
-    return Rays(rays.origins + distance[:, None] * rays.directions, directions, rays.fired)
+    return Rays(rays.origins + distance[:, None] * rays.directions, directions, rays.times)
 
 
 def _gain(returns: Returns, hits: Hits, distance: Array) -> Array:

@@ -17,11 +17,10 @@ from lslam.core.geometry.geodesy import to_local
 from lslam.core.types.arrays import Floats
 from lslam.core.untrusted import MISFIT, parse_json, parse_toml
 from lslam.io.formats.trajectory_files import read_trajectory
-from lslam.simulation.curve import RouteCurve, rounded_rectangle, smooth_curve, winding_line
+from lslam.simulation.curve import RouteCurve, flat, rounded_rectangle, smooth_curve, winding_line
 from lslam.simulation.indoors import room_line, stairs_line
 from lslam.simulation.path import SpeedProfile, drive, suspension
 from lslam.simulation.scenario_files import SHAPES, Scenario, out_and_back
-from lslam.simulation.terrain import flat
 
 SPARE = 60.0  # m of street before the start and after the end of an open line
 TURN_RADIUS_M = 6.0  # m, radius of the U-turn of an out-and-back: a car on full lock
@@ -63,7 +62,7 @@ class Visit:
 FIRST_VISIT = Visit()
 
 
-def visited(route: Route, scenario: Scenario, visit: Visit) -> Route:
+def revisit(route: Route, scenario: Scenario, visit: Visit) -> Route:
     """Route of a visit; the street, and with it the town, is unchanged.
 
     Raises UsageError for a shift beyond the line, and for a line in three dimensions, which has no other visit.
@@ -182,13 +181,13 @@ class WayPoints:
     """Points (N, 2) or (N, 3), m, x and y level and z up when it is given; a closed line does not repeat its first point.
 
     origin : (3,) lat, lon (deg), height (m) of x = y = 0 where the points are positions on the Earth
-    is_placed : False for a shape that may be rotated and shifted
+    has_place : False for a shape that may be rotated and shifted
     """
 
     points: Floats
     closed: bool = False
     origin: Floats | None = None
-    is_placed: bool = True
+    has_place: bool = True
 
 
 def read_way_points(path: Path, origin: NDArray[Any] | None = None) -> WayPoints:
@@ -205,14 +204,14 @@ def read_way_points(path: Path, origin: NDArray[Any] | None = None) -> WayPoints
     if not path.is_file():
         raise InputError(f"{path} does not exist: --path takes a trajectory or a file of way-points")
     if path.suffix == ".csv" and _is_table(path):
-        found = _from_csv(path)
+        way_points = _from_csv(path)
     elif path.suffix == ".toml":
-        found = _from_toml(path)
+        way_points = _from_toml(path)
     elif path.suffix in (".geojson", ".json"):
-        found = _from_geojson(path, origin)
+        way_points = _from_geojson(path, origin)
     else:
-        found = _from_trajectory(path)
-    return _require_usable(path, found)
+        way_points = _from_trajectory(path)
+    return _require_usable(path, way_points)
 
 
 def _text(path: Path) -> str:
@@ -314,7 +313,7 @@ def _from_trajectory(path: Path) -> WayPoints:
     if len(xy) > 1:
         c, s = xy[1] / portable.norm(xy[1])
         xy = portable.product(xy, np.array([[c, -s], [s, c]]))
-    return WayPoints(xy, is_placed=False)
+    return WayPoints(xy, has_place=False)
 
 
 def _array(path: Path, values: Any) -> Floats:
@@ -327,14 +326,14 @@ def _array(path: Path, values: Any) -> Floats:
     return points
 
 
-def _require_usable(path: Path, found: WayPoints) -> WayPoints:
+def _require_usable(path: Path, way_points: WayPoints) -> WayPoints:
     """Way-points unchanged. Raises InputError if they are too few, too close or too short."""
-    points = found.points
-    ring = np.concatenate([points, points[:1]]) if found.closed else points
+    points = way_points.points
+    ring = np.concatenate([points, points[:1]]) if way_points.closed else points
     steps = np.linalg.norm(np.diff(ring[:, :2], axis=0), axis=1)
-    needed = 3 if found.closed else 2
+    needed = 3 if way_points.closed else 2
     if len(points) < needed:
-        what = "a closed path" if found.closed else "a path"
+        what = "a closed path" if way_points.closed else "a path"
         raise InputError(f"{path} holds too few way-points: {len(points)}, {what} needs {needed}")
     if steps.sum() < 15:
         raise InputError(f"{path} holds a path of {steps.sum():.1f} m: at least 15 m are needed")
@@ -342,4 +341,4 @@ def _require_usable(path: Path, found: WayPoints) -> WayPoints:
         raise InputError(f"{path}: way-point {int(np.argmin(steps)) + 2} is the same as the one before")
     if steps.max() > LONGEST_STEP_M:
         raise InputError(f"{path}: {steps.max() / 1000:.0f} km between neighbours: way-points are in metres")
-    return found
+    return way_points

@@ -46,7 +46,7 @@ _MOTORWAY = [(0, 0), (380, 0), (760, 95), (1150, 60)]
 _WALK = [(0, 0), (38, 2), (52, 24), (36, 48), (4, 44), (-10, 20)]
 
 
-def rounded(corners: Sequence[tuple[float, float]], radius: float, closed: bool) -> Floats:
+def round_corners(corners: Sequence[tuple[float, float]], radius: float, closed: bool) -> Floats:
     """(N, 2) points of a polygon through `corners`, m, rounded by arcs of `radius` m.
 
     An arc takes at most 0.45 of the shorter of its two sides, so the radius shrinks where corners are close.
@@ -84,13 +84,17 @@ def eight(width: float, depth: float, radius: float) -> Floats:
     Blocks measure `width` x `depth` m between the middles of the streets.
     """
     w, d = width, depth
-    right = rounded([(0, -d / 2 + radius), (0, d / 2), (w, d / 2), (w, -d / 2), (0, -d / 2), (0, 0)], radius, False)
-    left = rounded([(0, -d / 2 + radius), (0, d / 2), (-w, d / 2), (-w, -d / 2), (0, -d / 2), (0, 0)], radius, False)
+    right = round_corners(
+        [(0, -d / 2 + radius), (0, d / 2), (w, d / 2), (w, -d / 2), (0, -d / 2), (0, 0)], radius, False
+    )
+    left = round_corners(
+        [(0, -d / 2 + radius), (0, d / 2), (-w, d / 2), (-w, -d / 2), (0, -d / 2), (0, 0)], radius, False
+    )
     # Both end where the arc back into the shared street ends; the next lap continues there.
-    return np.concatenate([_until_shared(right), _until_shared(left)])
+    return np.concatenate([_half_of_eight(right), _half_of_eight(left)])
 
 
-def _until_shared(line: Floats) -> Floats:
+def _half_of_eight(line: Floats) -> Floats:
     """Half of an eight without the street that it shares with the other half."""
     far = np.flatnonzero(np.abs(line[:, 0]) > 1e-6)[-1]
     return line[: far + 1]
@@ -119,16 +123,16 @@ def _straight(length: float) -> Shape:
 
 
 SHAPES: dict[str, tuple[Shape, bool]] = {
-    "closed": (lambda _: rounded(_CLOSED, 30.0, True), True),
-    "open": (lambda _: rounded(_OPEN, 32.0, False), False),
+    "closed": (lambda _: round_corners(_CLOSED, 30.0, True), True),
+    "open": (lambda _: round_corners(_OPEN, 32.0, False), False),
     "spiral": (lambda _: spiral(45.0, 21.0, 1.75), False),
     "eight": (lambda _: eight(45.0, 37.0, 11.0), True),
     "large-eight": (lambda _: eight(85.0, 70.0, 18.0), True),
-    "residential": (lambda _: rounded(_RESIDENTIAL, 14.0, True), True),
-    "urban": (lambda _: rounded(_URBAN, 14.0, True), True),
-    "walk": (lambda _: rounded(_WALK, 5.0, True), True),
+    "residential": (lambda _: round_corners(_RESIDENTIAL, 14.0, True), True),
+    "urban": (lambda _: round_corners(_URBAN, 14.0, True), True),
+    "walk": (lambda _: round_corners(_WALK, 5.0, True), True),
     "straight": (_straight(300.0), False),
-    "motorway": (lambda _: rounded(_MOTORWAY, 700.0, False), False),
+    "motorway": (lambda _: round_corners(_MOTORWAY, 700.0, False), False),
 }
 """Way-points by name, and whether they close; `length` of a scenario scales them."""
 
@@ -179,7 +183,7 @@ class WorldSection(Section):
     glass: float = Field(0.0, ge=0, le=1)
 
     @model_validator(mode="after")
-    def _slope_is_ordered(self) -> WorldSection:
+    def _check_slope(self) -> WorldSection:
         low, high = self.slope
         if not 0 <= low <= high <= 0.2:
             raise ValueError(f"world.slope = [{low:g}, {high:g}], expected two numbers from 0 to 0.2, in order")
@@ -238,7 +242,7 @@ class Scenario(Section):
         return self.returns if self.returns.is_on or self.layout.volumes else None
 
     @model_validator(mode="after")
-    def _names_are_known(self) -> Scenario:
+    def _check_names(self) -> Scenario:
         if self.path.shape not in LINES:
             raise ValueError(f"path.shape = {self.path.shape!r}; {nearest(self.path.shape, LINES)}")
         shape, own = self.path.shape, INDOORS.get(self.world.kind)
@@ -265,7 +269,7 @@ def scenario_names() -> tuple[str, ...]:
     return tuple(sorted(read_package_files("lslam.simulation", "ready")))
 
 
-def scenario_named(name: str, settings: Iterable[str] = ()) -> Scenario:
+def find_scenario(name: str, settings: Iterable[str] = ()) -> Scenario:
     """Ready scenario `name`, or that of the file `name`.toml, with overrides `settings` ("speed=8", "world.relief=1").
 
     Raises
@@ -279,7 +283,7 @@ def scenario_named(name: str, settings: Iterable[str] = ()) -> Scenario:
 
 
 def scenario_text(scenario: Scenario) -> str:
-    """Scenario as TOML with every key; `scenario_named` reads it back."""
+    """Scenario as TOML with every key; `find_scenario` reads it back."""
 
     return toml_text(scenario.model_dump(mode="json", exclude={"name"}, exclude_none=True))
 

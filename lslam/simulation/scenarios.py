@@ -21,17 +21,16 @@ from lslam.core.types.sequence import Calibration, Scans
 from lslam.core.types.trajectory import Trajectory
 from lslam.simulation.built_scenario import build_scenario, check_path, populate
 from lslam.simulation.city import City
-from lslam.simulation.imu import ImuModel, imu_named
+from lslam.simulation.imu import ImuModel, find_imu
 from lslam.simulation.kinematics import Motion, PosePath, shaking, smooth_motion, standing_start
 from lslam.simulation.lidar import Roof, trace
-from lslam.simulation.lidar_models import LidarModel, LidarMount, lidar_named
+from lslam.simulation.lidar_models import LidarModel, LidarMount, find_lidar
 from lslam.simulation.moving import Mover, moving_meshes
 from lslam.simulation.osm_place import read_extract
 from lslam.simulation.routes import FIRST_VISIT, Visit, WayPoints, read_way_points
-from lslam.simulation.scenario_files import Scenario, scenario_named
+from lslam.simulation.scenario_files import Scenario, find_scenario
 from lslam.simulation.scene_mesh import RayScene
-from lslam.simulation.sensors import BASE, ORIGIN, GnssModel, Sensors, read_sensors
-from lslam.simulation.wheels import WheelModel
+from lslam.simulation.sensors import BASE, ORIGIN, GnssModel, Sensors, WheelModel, read_sensors
 
 FASTEST = 40.0  # m/s
 LONGEST_STAND = 600.0  # s
@@ -41,7 +40,7 @@ _MOUNT_SEED = 2**32 - 17  # of those of further LiDARs
 
 
 @dataclass(frozen=True)
-class Mounted:
+class MountedMotion:
     """Motion of a sensor at `T_lidar_other` (4, 4) from the LiDAR with motion `motion`."""
 
     motion: Motion
@@ -81,7 +80,7 @@ class SimulatedDrive(Scans):
         self.scenario, self.city, self.lidar, self.movers = scenario, city, lidar, list(movers)
         # One function of time for the rays, the truth and all other sensors.
         self.vehicle = smooth_motion(path)
-        self._motion: Motion | Mounted = self.vehicle
+        self._motion: Motion | MountedMotion = self.vehicle
         self.seed, self.visit = seed, visit
         self._seeds = visit.seeds(seed)
         self.name = f"{scenario.name}-{seed}" + (f"-visit{visit.number}" if visit.number else "")
@@ -129,14 +128,18 @@ class SimulatedDrive(Scans):
         """The drive as another LiDAR sees it, with noise of its own and without the roof."""
         other, T, late_ns = copy.copy(self), mount.T_lidar_other, round(1e6 * mount.offset_ms)
         other.name, other.path = f"{self.name}-{mount.name}", Path(f"{self.name}-{mount.name}")
-        other.lidar = self.lidar if mount.lidar is None else _with_ring_errors(lidar_named(mount.lidar), self.scenario)
+        other.lidar = self.lidar if mount.lidar is None else _with_ring_errors(find_lidar(mount.lidar), self.scenario)
         # A last sweep that begins late would end after the drive.
         other.stamps_ns = self.stamps_ns[: len(self) - (late_ns > 0)] + late_ns
         if not len(other.stamps_ns):
             raise UsageError(
                 f"{mount.name} begins its sweeps {mount.offset_ms:g} ms late: at least two scans are needed"
             )
-        other._motion, other._roof, other._seeds = Mounted(self.vehicle, T), None, (*self._seeds, _MOUNT_SEED, number)
+        other._motion, other._roof, other._seeds = (
+            MountedMotion(self.vehicle, T),
+            None,
+            (*self._seeds, _MOUNT_SEED, number),
+        )
         other._shaking = shaking(self.scenario.vibration, np.random.default_rng([*other._seeds, _SHAKING_SEED]))
         poses = other.city_poses
         other.T_city_world = poses[0]
@@ -159,7 +162,7 @@ class SimulatedDrive(Scans):
         if not self.motion_compensated:
             poses = self._motion.poses(fired)
         if self._shaking is not None:
-            poses = self._shaking.shaken(poses, fired)
+            poses = self._shaking.shake(poses, fired)
         rng = np.random.default_rng([*self._seeds, index])
         here = poses if poses.ndim == 2 else poses[len(poses) // 2]
         bodies = moving_meshes(self.movers, here[:3, 3], start, self.lidar.range_max + SPARE_REACH)
@@ -223,9 +226,9 @@ def simulate(
         take: through a building or the ground, or too sharp a bend
     InputError : a file that is missing or broken, an extract without buildings or far from the path
     """
-    chosen = scenario_named(scenario, settings) if isinstance(scenario, str) else scenario
+    chosen = find_scenario(scenario, settings) if isinstance(scenario, str) else scenario
     model = chosen.lidar if lidar is None else lidar
-    model = _with_ring_errors(lidar_named(model) if isinstance(model, str) else model, chosen)
+    model = _with_ring_errors(find_lidar(model) if isinstance(model, str) else model, chosen)
     cruise = chosen.speed if speed is None else speed
     begin = (
         (cruise if chosen.carrier == "drone" and chosen.start_speed else min(chosen.start_speed, cruise))
@@ -235,7 +238,7 @@ def simulate(
     _check(seed, count, cruise, begin)
     if not 0 <= static_start <= LONGEST_STAND:
         raise UsageError(f"--static-start {static_start:g} is out of range: 0 to {LONGEST_STAND:g} s")
-    measuring = imu_named(imu) if isinstance(imu, str) else imu
+    measuring = find_imu(imu) if isinstance(imu, str) else imu
     sensors = Sensors(None if measuring is None else chosen.imu.of(measuring), gnss, wheels)
     chosen = chosen.model_copy(update={"speed": cruise, "start_speed": begin})
     given = None if origin is None else checked_origin(origin)

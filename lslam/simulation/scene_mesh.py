@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,43 @@ class Surface(IntEnum):
     CROWN = 12  # of leaves that fill a volume; so is a hedge
     HEDGE = 13
     PANE = 14  # glass of a vehicle
+
+
+Colour = tuple[int, int, int]
+
+
+class SurfaceLook(NamedTuple):
+    """What a surface looks like.
+
+    reflectivity : share of the light of a 905 nm laser that comes back where it is met squarely
+    label : class of its points; colour, plan_colour : red, green, blue in images of a camera, and in a plan. Colours of a camera
+        are apart from one another by more than exposure and noise.
+    """
+
+    reflectivity: float
+    label: str
+    colour: Colour
+    plan_colour: Colour
+
+
+LOOKS = {
+    Surface.ROAD: SurfaceLook(0.35, "road", (95, 95, 100), (96, 96, 100)),
+    Surface.PAVEMENT: SurfaceLook(0.40, "sidewalk", (165, 160, 150), (168, 166, 160)),
+    Surface.LAWN: SurfaceLook(0.45, "terrain", (60, 150, 50), (206, 220, 184)),
+    Surface.WALL: SurfaceLook(0.45, "building", (215, 160, 100), (182, 120, 96)),
+    Surface.GLASS: SurfaceLook(0.03, "building", (60, 90, 170), (120, 160, 176)),
+    Surface.ROOF: SurfaceLook(0.25, "building", (170, 60, 40), (168, 92, 74)),
+    Surface.FOLIAGE: SurfaceLook(0.45, "vegetation", (35, 95, 40), (88, 136, 70)),
+    Surface.TRUNK: SurfaceLook(0.30, "trunk", (105, 70, 40), (104, 78, 54)),
+    Surface.POLE: SurfaceLook(0.40, "pole", (205, 205, 60), (20, 20, 20)),
+    Surface.CAR: SurfaceLook(0.35, "car", (200, 30, 130), (50, 76, 150)),
+    Surface.FENCE: SurfaceLook(0.35, "fence", (150, 110, 180), (90, 80, 70)),
+    Surface.PERSON: SurfaceLook(0.35, "person", (240, 120, 20), (200, 0, 160)),
+    Surface.CROWN: SurfaceLook(0.45, "vegetation", (90, 130, 20), (80, 130, 64)),
+    Surface.HEDGE: SurfaceLook(0.45, "vegetation", (20, 110, 90), (68, 118, 54)),
+    # Clear to a camera: what is behind it is the car as well.
+    Surface.PANE: SurfaceLook(0.03, "car", (200, 30, 130), (124, 150, 170)),
+}
 
 
 def is_glass(surfaces: NDArray[np.uint8]) -> Bools:
@@ -82,6 +119,10 @@ class MeshBuilder:
         faces = np.concatenate([first + np.array([0, 1, 2]), first + np.array([0, 2, 3])])
         self.add(corners.reshape(-1, 3), faces, surface)
 
+    def add_grid(self, xy: Floats, z: Floats, surface: int) -> None:
+        """Add a sheet through a grid of places (R, C, 2) at heights (R, C), m."""
+        self.add(grid_vertices(xy, z), grid_faces(*z.shape), surface)
+
     def add_box(self, low: Any, high: Any, surface: int) -> None:
         """Add an axis-aligned box between two corners (3,)."""
         self.add(*box(low, high), surface)
@@ -122,6 +163,11 @@ def tube(radius_low: float, radius_high: float, bottom: float, top: float, sides
         [np.stack([here, there, there + sides], 1), np.stack([here, there + sides, here + sides], 1)]
     )
     return np.concatenate([low, high]), faces
+
+
+def grid_vertices(xy: Floats, z: Floats) -> Floats:
+    """Vertices (R * C, 3) of a grid of places (R, C, 2) at heights (R, C), row by row."""
+    return np.concatenate([xy, z[..., None]], -1).reshape(-1, 3)
 
 
 def grid_faces(rows: int, columns: int) -> Longs:

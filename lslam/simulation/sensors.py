@@ -1,4 +1,4 @@
-"""Sensors beside the LiDAR: an IMU and a satellite receiver, their mounting, and their readings."""
+"""Sensors beside the LiDAR: an IMU, a satellite receiver and the wheels of a car, their mounting, and their readings."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from lslam.core.geometry import geodesy, portable, se3
 from lslam.core.printable import toml_text
 from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.gnss import GnssStream
+from lslam.core.types.imu import WheelStream
 from lslam.core.types.trajectory import Trajectory
 from lslam.io.formats.atomic import write_text
 from lslam.io.formats.stamped_csv import write_gnss_csv, write_imu_csv, write_stamped_csv, write_wheels_csv
-from lslam.io.formats.trajectory_files import write_tum
-from lslam.simulation.imu import GRAVITY, T_CAR_IMU, T_OUSTER_IMU, ImuModel, SimulatedImu, simulate_imu
+from lslam.io.formats.trajectory_lines import write_tum
+from lslam.simulation.imu import GRAVITY, T_CAR_IMU, T_OUSTER_IMU, ImuModel, SimulatedImu, reading_stamps, simulate_imu
 from lslam.simulation.kinematics import Motion
-from lslam.simulation.wheels import T_CAR_BASE, SimulatedWheels, WheelModel, simulate_wheels
 
 # lat, lon (deg), height (m) of the city's origin unless a scenario has its own: open ground at Karlsruhe.
 ORIGIN = np.array([49.0, 8.4, 115.0])
@@ -30,12 +30,11 @@ T_DRONE_ANTENNA = se3.make(np.eye(3), np.array([-0.1, 0.0, 0.35]))
 T_WALKER_ANTENNA = se3.make(np.eye(3), np.array([-0.05, 0.0, 0.25]))
 IMU_FILE, GNSS_FILE, WHEELS_FILE, TRUTH = "imu.csv", "gnss.csv", "wheels.csv", "truth"
 TRUTH_HZ = 100
+# Middle of the rear axle below the LiDAR on KITTI's car: it hardly moves sideways.
+T_CAR_BASE = se3.make(np.eye(3), np.array([-0.76, 0.0, -1.73]))
 BASE = "base_link"
-_IMU_SEED, _GNSS_SEED, _WHEELS_SEED = (
-    2**32 - 11,
-    2**32 - 12,
-    2**32 - 14,
-)  # of the generators; the scenarios count down from 2**32 - 1
+# Of the generators; the scenarios count down from 2**32 - 1.
+_IMU_SEED, _GNSS_SEED, _WHEELS_SEED = 2**32 - 11, 2**32 - 12, 2**32 - 14
 
 
 @dataclass(frozen=True)
@@ -92,12 +91,11 @@ def simulate_gnss(
     1..10 Hz, negative errors or an outage that ends before it starts.
     """
     check_gnss(model)
-    count = int(np.floor(end * model.rate_hz + 1e-6)) + 1
-    stamps = np.round(np.arange(count) * (1e9 / model.rate_hz)).astype(np.int64)
+    stamps = reading_stamps(model.rate_hz, end)
     times = stamps / 1e9
     antenna = portable.product(motion.poses(times), T_lidar_gnss)[:, :3, 3]
-    error = _errors(model, count, rng)
-    seen = np.ones(count, bool)
+    error = _errors(model, len(times), rng)
+    seen = np.ones(len(times), bool)
     for begin, finish in model.outages:
         seen &= (times < begin) | (times > finish)
     fixes = geodesy.from_local(antenna[seen] + error[seen], origin)
@@ -126,6 +124,72 @@ def _errors(model: GnssModel, count: int, rng: np.random.Generator) -> Floats:
     driven[:1] = draws[:1, 1]
     slow = np.asarray(lfilter([1.0], [1.0, -keep], driven, axis=0))
     return np.asarray((model.white * draws[:, 0] + model.slow * slow) * [1.0, 1.0, model.vertical])
+
+
+@dataclass(frozen=True)
+class WheelModel:
+    """Speed and yaw rate as a car's bus tells them.
+
+    scale : largest error of the scale, drawn evenly; yaw_scale : likewise of the yaw rate; yaw_offset : one sigma, rad/s
+    noise, yaw_noise : one sigma of a reading, m/s and rad/s; step : of a speed, m/s, as pulses are counted
+    latency_s : by which a reading is stamped too late
+    slip : largest share of the speed by which wheels spin or lock, slip_s : the longest it lasts, every : mean s between
+    """
+
+    rate_hz: float = 50.0
+    scale: float = 0.02
+    yaw_scale: float = 0.02
+    yaw_offset: float = 0.003
+    noise: float = 0.02
+    yaw_noise: float = 0.003
+    step: float = 0.01
+    latency_s: float = 0.03
+    slip: float = 0.2
+    slip_s: float = 0.8
+    every: float = 20.0
+
+
+@dataclass(frozen=True)
+class SimulatedWheels:
+    """Readings, and the truth behind them: scale, yaw_scale and yaw_offset as drawn; slip : (M,) share of each reading."""
+
+    stream: WheelStream
+    scale: float
+    yaw_scale: float
+    yaw_offset: float
+    slip: Floats
+
+
+def simulate_wheels(
+    motion: Motion, model: WheelModel, T_lidar_base: Floats, end: float, rng: np.random.Generator
+) -> SimulatedWheels:
+    """Readings of wheels at `T_lidar_base` (4, 4), from 0 to `end` s of `motion`; the same generator gives the same."""
+    stamps = reading_stamps(model.rate_hz, end)
+    scale, yaw_scale = rng.uniform(-1, 1, 2) * [model.scale, model.yaw_scale]
+    yaw_offset = model.yaw_offset * rng.standard_normal()
+    slip = _slip(model, stamps / 1e9, end, rng)
+    noise = rng.standard_normal((len(stamps), 2))
+    taken = np.clip(stamps / 1e9 - model.latency_s, 0.0, motion.duration)
+    exact = motion.at(taken).at_sensor(T_lidar_base)
+    forward = portable.dot(exact.velocity, exact.poses[:, :3, 0])
+    speed = (1 + scale) * (1 + slip) * forward + model.noise * noise[:, 0] * (np.abs(forward) > model.step)
+    if model.step > 0:
+        speed = np.round(speed / model.step) * model.step
+    yaw_rate = (1 + yaw_scale) * exact.rate[:, 2] + yaw_offset + model.yaw_noise * noise[:, 1]
+    stream = WheelStream(stamps, speed, yaw_rate, T_lidar_base)
+    return SimulatedWheels(stream, float(scale), float(yaw_scale), float(yaw_offset), slip)
+
+
+def _slip(model: WheelModel, times: Floats, end: float, rng: np.random.Generator) -> Floats:
+    """(M,) share of the speed by which wheels turn faster than they roll, at `times` (M,), s: half sines now and then."""
+    slip = np.zeros(len(times))
+    begin = float(rng.exponential(model.every))
+    while begin < end:
+        lasts, size = rng.uniform(0.3, 1.0) * model.slip_s, rng.uniform(-1, 1) * model.slip
+        phase = (times - begin) / lasts
+        slip += np.where((phase > 0) & (phase < 1), size * portable.sin(np.pi * np.clip(phase, 0, 1)), 0.0)
+        begin += lasts + float(rng.exponential(model.every))
+    return slip
 
 
 @dataclass(frozen=True)
@@ -224,7 +288,6 @@ def write_truth(folder: Path, motion: Motion, scan_stamps_ns: Longs, end: float,
 
 
 def _write_world(path: Path, T_enu_world: Floats, origin: Floats) -> None:
-
     down = np.array([0.0, 0.0, -GRAVITY])
     tree = {
         "origin_lat_lon_alt": origin.tolist(),

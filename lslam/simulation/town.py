@@ -10,19 +10,17 @@ from numpy.typing import NDArray
 from lslam.core.geometry import portable
 from lslam.core.types.arrays import Floats
 from lslam.simulation.city import (
-    KERB,
     City,
     Layout,
     Lots,
+    Site,
     add_garden_trees,
     add_ground,
+    add_road,
     add_row,
     add_street_furniture,
-    crown_of_road,
 )
-from lslam.simulation.curve import RouteCurve, smooth_curve
-from lslam.simulation.scene_mesh import MeshBuilder, Surface, grid_faces
-from lslam.simulation.terrain import Terrain
+from lslam.simulation.curve import RouteCurve, Terrain, smooth_curve
 
 SHORTEST_SIDE_M = 30.0  # m of a side street
 LONGEST_SIDE_M = 110.0
@@ -64,24 +62,23 @@ def build_town(
         newest = _side_streets(newest, streets, layout, spacing, rng)
         streets = [*streets, *newest]
     network = Network(streets)
-    builder = MeshBuilder()
-    for street in streets:
-        add_road(builder, street, network, terrain, layout, rng)
+    place = Site.begin(main[0], terrain, layout, rng)
+    sites = [place.along(street) for street in streets]
+    for site in sites:
+        add_road(site, network.distance)
     # Grass closes the dead ends: their last metres do not count as road.
-    add_ground(
-        builder, [_shorten(street, layout.band) for street in streets], terrain, layout, rng, 0.75 * layout.pavement
-    )
+    add_ground(place, [_shorten(street, layout.band) for street in streets], 0.75 * layout.pavement)
     lots = Lots(streets, layout)
     for first in (True, False):
-        for street in streets if first else main:
+        for site in sites if first else sites[: len(main)]:
             for side in (1, -1):
-                add_row(builder, lots, street, terrain, layout, rng, side, first)
+                add_row(site, lots, side, first)
     places = Places(network, layout)
-    for street in streets:
+    for site in sites:
         for side in (1, -1):
-            add_street_furniture(builder, street, terrain, layout, rng, side, places)
-    add_garden_trees(builder, lots, terrain, layout, rng)
-    return City(builder.build(), terrain, main[0], lots.footprints, lots.heights, streets)
+            add_street_furniture(site, side, places)
+    add_garden_trees(place, lots)
+    return City(place.builder.build(), terrain, main[0], lots.footprints, lots.heights, streets)
 
 
 class Places:
@@ -121,7 +118,7 @@ def _side_streets(
     """Streets off `main` on both sides. Each ends at one of `streets` or at an earlier side street, or at its own length."""
     from scipy.spatial import cKDTree
 
-    taken = np.concatenate([street.position(street.sample(0.5)) for street in streets])
+    street_tree = np.concatenate([street.position(street.sample(0.5)) for street in streets])
     out: list[RouteCurve] = []
     for street in main:
         for side in (1, -1):
@@ -135,18 +132,20 @@ def _side_streets(
                 tangent = street.tangent(at)[0] * side
                 heading = portable.arctan2(tangent[1], tangent[0]) + np.pi / 2 + turn
                 ray = np.array([portable.cos(heading), portable.sin(heading)])
-                line = _until_met(street.position(at)[0], ray, length, cKDTree(taken), layout)
+                line = _street_until_crossing(street.position(at)[0], ray, length, cKDTree(street_tree), layout)
                 if line is not None:
                     out.append(line)
-                    taken = np.concatenate([taken, line.position(line.sample(0.5))])
+                    street_tree = np.concatenate([street_tree, line.position(line.sample(0.5))])
     return out
 
 
-def _until_met(start: Floats, ray: Floats, length: float, taken: Any, layout: Layout) -> RouteCurve | None:
+def _street_until_crossing(
+    start: Floats, ray: Floats, length: float, street_tree: Any, layout: Layout
+) -> RouteCurve | None:
     """Straight street from `start` along `ray` (2,) until it meets another; None when it would run too close to one."""
     steps = np.arange(0.0, length, 0.5)
     points = start + steps[:, None] * ray
-    away = np.asarray(taken.query(points)[0])
+    away = np.asarray(street_tree.query(points)[0])
     room = 2 * layout.band + ROW_M
     clear = steps > 1.25 * room
     met = np.flatnonzero(clear & (away < 0.5))
@@ -158,31 +157,3 @@ def _until_met(start: Floats, ray: Floats, length: float, taken: Any, layout: La
     if near > (1.25 * room if len(met) else 0.0):
         return None
     return smooth_curve(points[[0, end - 1]], closed=False)
-
-
-def add_road(
-    builder: MeshBuilder,
-    street: RouteCurve,
-    network: Network,
-    terrain: Terrain,
-    layout: Layout,
-    rng: np.random.Generator,
-) -> None:
-    """Add road, kerbs and pavements as one strip along the street; no kerb where another road crosses."""
-    s = street.sample(0.75)
-    if street.closed:
-        s = np.append(s, 0.0)
-    half = [0.0, 1.5, 3.0, layout.road, layout.road + 0.02, 0.5 * (layout.road + layout.band), layout.band]
-    offsets = np.array([-d for d in half[:0:-1]] + half)
-    xy = np.stack([street.beside(s, d) for d in offsets])
-    beyond = np.abs(offsets)[:, None] > layout.road + 0.01
-    raised = beyond & (network.distance(xy) > layout.road + 0.005)
-    rough = rng.normal(0, 0.003, xy.shape[:2])
-    if street.closed:
-        rough[:, -1] = rough[:, 0]
-    z = terrain.height(xy) + KERB * raised + rough
-    if layout.camber:
-        z += crown_of_road(offsets, layout)[:, None]
-    faces = grid_faces(len(offsets), len(s))
-    kinds = np.where(raised.ravel()[faces].any(axis=1), Surface.PAVEMENT, Surface.ROAD).astype(np.uint8)
-    builder.add(np.concatenate([xy, z[..., None]], -1).reshape(-1, 3), faces, kinds)

@@ -13,9 +13,8 @@ from lslam.core.config.study import StudySequence
 from lslam.core.errors import InputError, UsageError
 from lslam.core.printable import file_safe
 from lslam.io.formats.bag_listing import stem_of
-from lslam.io.readers import open_sequence
+from lslam.io.readers import find_folder, open_sequence
 from lslam.io.readers.kitti_raw import with_imu
-from lslam.io.readers.lookup import find_folder
 from lslam.io.remote import RemotePath, as_path
 from lslam.pipeline.resume import imu_digest, input_digest, job_digest, listing_digest
 from lslam.studies.output import SIMULATED, OutputOptions

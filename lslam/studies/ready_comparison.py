@@ -20,16 +20,13 @@ from lslam.core.printable import file_safe, significant
 from lslam.core.types.arrays import Floats
 from lslam.core.types.comparison import RunScore, Table
 from lslam.core.untrusted import parse_toml
-from lslam.evaluation.beside import Judgement, difficulty, judge_number, judge_order, judge_time, spread
-from lslam.evaluation.thesis import RPY
+from lslam.evaluation.thesis import RPY, Judgement, difficulty, judge_number, judge_order, judge_time, median_and_worst
 from lslam.io.formats.osm_buildings import read_buildings
 from lslam.io.formats.osm_files import write_osm
 from lslam.io.formats.trajectory_files import read_trajectory
-from lslam.io.readers import open_sequence
+from lslam.io.readers import find_folder, open_sequence
 from lslam.io.readers.kitti_raw import start_on_earth
-from lslam.io.readers.lookup import find_folder
-from lslam.simulation.osm_extract import EXACT, PERTURBED, osm_from_buildings
-from lslam.simulation.osm_perturb import MapFaults, draw_perturbation, perturb
+from lslam.simulation.osm_extract import EXACT, PERTURBED, MapFaults, draw_perturbation, osm_from_buildings, perturb
 from lslam.studies.grid import Cell
 from lslam.studies.variants import Imu, Variant, find_variants
 
@@ -215,7 +212,7 @@ class ReadyComparison(Section):
         path = out / MAPS / f"{cell.sequence}-{cell.seed}-{kind}.osm"
         origin = _world_of(cell)[1]
         exact = read_buildings(cell.path / EXACT, origin)[1].buildings
-        none = {"simplified": 0.0, "merged": 0.0, "missing": 0.0, "new": 0.0}
+        none = {"simplify_share": 0.0, "merge_share": 0.0, "missing": 0.0, "new": 0.0}
         turn = float(np.radians(errors.house_deg))
         faults = MapFaults(errors.offset_m, 1.0, errors.house_m, 1.0, turn, **none)
         perturbation = draw_perturbation(exact, faults, np.random.default_rng(cell.seed))
@@ -313,7 +310,7 @@ def _values(runs: Sequence[RunScore], sequence: str, method: str, of: Quantity) 
 
 
 def _spread(values: Sequence[float]) -> str:
-    return " / ".join("failed" if value == inf else significant(value) for value in spread(values))
+    return " / ".join("failed" if value == inf else significant(value) for value in median_and_worst(values))
 
 
 def comparison_names() -> tuple[str, ...]:

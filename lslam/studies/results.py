@@ -152,7 +152,7 @@ def _add_errors(path: Path, manifest: dict[str, Any], values: dict[str, float]) 
 
 def metrics_of(configs: Sequence[EvalConfig], runs: Sequence[RunScore]) -> list[Metric]:
     """All numbers that the runs may have, in the order of the table; those for programs alone come last."""
-    errors = [metric for entry in METRICS for metric in entry.compared(configs)]
+    errors = [metric for entry in METRICS for metric in entry.comparison_metrics(configs)]
     stages = list(dict.fromkeys(name for run in runs for name in run.stages))
     return [
         *(metric for metric in errors if metric.is_main),
@@ -163,7 +163,7 @@ def metrics_of(configs: Sequence[EvalConfig], runs: Sequence[RunScore]) -> list[
         Metric("factor", "real time", "x", "time", "recorded time over processing time (mean)", "high"),
         *(Metric(key, HEALTH[key], "scans", "health", recipe, "") for key, recipe in COUNTS.items()),
         *(metric for metric in errors if not metric.is_main),
-        *(_more(f"odometry.{m.key}", m.unit, "error") for m in ONLY_BEFORE.compared(configs)),
+        *(_more(f"odometry.{m.key}", m.unit, "error") for m in ONLY_BEFORE.comparison_metrics(configs)),
         _more("path", "m", "error"),
         _more("map.entropy", "nats", "error"),
         _more("map.plane_variance", "m2", "error"),

@@ -16,9 +16,8 @@ from lslam.core.config import Config
 from lslam.core.config.input import AS_CONFIGURED, InputConfig, ScanRange
 from lslam.core.errors import InputError, OutputExistsError, UsageError, nearest
 from lslam.core.printable import file_safe
-from lslam.io.readers import open_sequence
-from lslam.io.readers.lookup import find_folder
-from lslam.simulation.scenario_files import scenario_named
+from lslam.io.readers import find_folder, open_sequence
+from lslam.simulation.scenario_files import find_scenario
 
 if TYPE_CHECKING:
     from lslam.simulation.scenarios import SimulatedDrive
@@ -51,7 +50,7 @@ def scene_digest(scene: Scene, seed: int) -> str:
 
     Raises UsageError, ConfigError or InputError for a scenario that is none.
     """
-    scenario = scenario_named(scene.scenario, scene.settings)
+    scenario = find_scenario(scene.scenario, scene.settings)
     said = {
         "scenario": scenario.model_dump(mode="json"),
         "scene": {**asdict(scene), "scenario": ""},
@@ -97,12 +96,12 @@ def simulate_once(
 
 def drive_of(scene: Scene, seed: int) -> SimulatedDrive:
     """Simulated drive whose scans are still to be made. Raises what `simulate` raises."""
-    from lslam.simulation.lidar_models import lidar_named
+    from lslam.simulation.lidar_models import find_lidar
     from lslam.simulation.scenarios import simulate
     from lslam.simulation.sensors import GnssModel
 
-    scenario = scenario_named(scene.scenario, scene.settings)
-    lidar = lidar_named(scene.lidar or scenario.lidar)
+    scenario = find_scenario(scene.scenario, scene.settings)
+    lidar = find_lidar(scene.lidar or scenario.lidar)
     return simulate(
         scenario,
         seed=seed,

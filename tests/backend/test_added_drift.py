@@ -13,7 +13,7 @@ from lslam.core.errors import InputError
 from lslam.core.geometry import se3, so3
 from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.trajectory import Keyframe, Trajectory
-from lslam.io.formats.trajectory_files import write_tum
+from lslam.io.formats.trajectory_lines import write_tum
 
 LINE = se3.make(np.eye(3), np.column_stack([np.linspace(0, 200, 401), np.zeros(401), np.zeros(401)]))
 RESULTS = [ScanResult(i, i * 100_000_000, T, covariance=np.eye(6)) for i, T in enumerate(LINE)]

@@ -26,7 +26,7 @@ from lslam.core.types.imu import GravityDirection, ImuDiagnostics
 from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.sequence import Calibration
 from lslam.core.types.trajectory import Keyframe
-from lslam.io.formats.g2o import write_g2o
+from lslam.io.formats.trajectory_lines import write_g2o
 
 # Two laps of 400 m, a scan each metre, a keyframe every other scan.
 Floats = NDArray[np.float64]

@@ -21,7 +21,7 @@ import lslam
 from lslam.core.config import load_config
 from lslam.core.geometry import se3, so3
 from lslam.core.types.trajectory import Trajectory
-from lslam.io.formats.trajectory_files import write_tum
+from lslam.io.formats.trajectory_lines import write_tum
 from lslam.pipeline.localise_pass import Reanchoring
 from lslam.simulation.record import record
 from lslam.simulation.scenarios import simulate

@@ -23,8 +23,7 @@ from lslam.core.config.config import Config
 from lslam.core.errors import LslamError
 from lslam.core.geometry import geodesy, se3, so3
 from lslam.pipeline.run import RunOutcome, run
-from lslam.simulation.osm_extract import write_extracts
-from lslam.simulation.osm_perturb import MapFaults
+from lslam.simulation.osm_extract import MapFaults, write_extracts
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 from lslam.simulation.sensors import ORIGIN, GnssModel
 

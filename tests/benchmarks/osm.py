@@ -39,7 +39,7 @@ from lslam.io.formats.osm_buildings import read_buildings
 from lslam.io.formats.trajectory_files import read_trajectory
 from lslam.osm.buildings_geojson import read_buildings_geojson
 from lslam.osm.corrections import BUILDINGS_GEOJSON
-from lslam.simulation.osm_perturb import read_perturbation
+from lslam.simulation.osm_extract import read_perturbation
 from lslam.studies.subjects import Scene, simulate_once
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))

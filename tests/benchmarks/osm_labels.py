@@ -35,7 +35,7 @@ def drive_of(seed: int, scans: int, parent: Path) -> Path:
     """The drive with its labels; made now unless it is there already."""
     folder = parent / f"urban-hard-{seed}"
     if not (folder / "sequences" / "00" / "manifest.json").is_file():
-        record(simulate("urban-hard", seed=seed, count=scans), folder, resume=True, is_labelled=True)
+        record(simulate("urban-hard", seed=seed, count=scans), folder, resume=True, has_labels=True)
     return folder / "sequences" / "00"
 
 

@@ -2,7 +2,7 @@
 
     python tests/benchmarks/wheels.py [--seeds 321-325] [--write docs/results.md]
 
-The wheels err in scale and yaw rate, are late, and slip (`lslam.simulation.wheels.WheelModel`). Those of another robot are the
+The wheels err in scale and yaw rate, are late, and slip (`lslam.simulation.sensors.WheelModel`). Those of another robot are the
 wheels of a drive elsewhere, in feet, with the yaw rate of the wrong sign.
 """
 
@@ -19,7 +19,7 @@ from traced import Traced, run_on, traced
 from lslam.core.geometry import se3
 from lslam.core.types.imu import WheelStream
 from lslam.simulation.scenarios import simulate
-from lslam.simulation.wheels import WheelModel
+from lslam.simulation.sensors import WheelModel
 
 # Scenario, sensor, scans, and every how many of them are used.
 DRIVES: dict[str, tuple[str, str, int, int]] = {

@@ -28,7 +28,8 @@ from lslam.core.types.constraint import LoopCandidate, LoopStage, Verdict
 from lslam.core.types.gnss import Georeference
 from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.trajectory import Trajectory
-from lslam.io.formats.trajectory_files import read_trajectory, write_tum
+from lslam.io.formats.trajectory_files import read_trajectory
+from lslam.io.formats.trajectory_lines import write_tum
 from lslam.maps.occupancy import OccupancyGrid
 from lslam.pipeline.back_end_pass import describe
 from lslam.pipeline.map_files import MapNote, write_map, write_occupancy

@@ -27,7 +27,8 @@ from shapely.geometry.base import BaseGeometry
 
 from lslam.core.geometry import se3, so3
 from lslam.core.geometry.geodesy import from_local
-from lslam.io.formats.trajectory_files import read_trajectory, write_tum
+from lslam.io.formats.trajectory_files import read_trajectory
+from lslam.io.formats.trajectory_lines import write_tum
 from lslam.pipeline.convert.convert_run import PATHS, convert_run
 from lslam.pipeline.rebuild import open_scans, read_run
 

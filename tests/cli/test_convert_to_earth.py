@@ -20,7 +20,8 @@ from lslam.core.geometry import se3, so3
 from lslam.core.geometry.geodesy import from_local
 from lslam.core.types.trajectory import Trajectory
 from lslam.io.formats.text_tables import utc_of
-from lslam.io.formats.trajectory_files import read_trajectory, write_tum
+from lslam.io.formats.trajectory_files import read_trajectory
+from lslam.io.formats.trajectory_lines import write_tum
 
 KML_NS, GX_NS = "{http://www.opengis.net/kml/2.2}", "{http://www.google.com/kml/ext/2.2}"
 GPX_NS = "{http://www.topografix.com/GPX/1/1}"

@@ -41,7 +41,8 @@ from made_runs import (
 
 from lslam.core.types.constraint import LoopCandidate, LoopStage, Verdict
 from lslam.core.types.gnss import Georeference
-from lslam.io.formats.trajectory_files import read_trajectory, write_tum
+from lslam.io.formats.trajectory_files import read_trajectory
+from lslam.io.formats.trajectory_lines import write_tum
 from lslam.pipeline.back_end_pass import describe
 from lslam.pipeline.deliver import deliver_run
 from lslam.pipeline.outputs import write_loops

@@ -28,7 +28,7 @@ def drive() -> SimulatedDrive:
 
 @pytest.fixture(scope="module")
 def recorded(drive: SimulatedDrive, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return record(drive, tmp_path_factory.mktemp("lights"), overwrite=True, is_labelled=True).sequence
+    return record(drive, tmp_path_factory.mktemp("lights"), overwrite=True, has_labels=True).sequence
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,8 @@ from calling import Done, lslam
 
 from lslam.core.geometry import se3
 from lslam.core.types.trajectory import Trajectory
-from lslam.io.formats.trajectory_files import write_euroc, write_kitti, write_tum
+from lslam.io.formats.trajectory_csv import write_euroc
+from lslam.io.formats.trajectory_lines import write_kitti, write_tum
 
 
 def evaluated(*words: object) -> Done:

@@ -17,7 +17,7 @@ from point_writers import write_points
 
 from lslam.core.geometry import se3, so3
 from lslam.core.types.trajectory import Trajectory
-from lslam.io.formats.trajectory_files import write_tum
+from lslam.io.formats.trajectory_lines import write_tum
 from lslam.io.readers import open_sequence
 
 

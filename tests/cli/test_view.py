@@ -20,7 +20,7 @@ from lslam.core.types.cloud import ArrayCloud
 from lslam.core.types.gnss import Georeference
 from lslam.core.types.trajectory import Trajectory
 from lslam.io.formats.point_files import read_cloud
-from lslam.io.formats.trajectory_files import write_tum
+from lslam.io.formats.trajectory_lines import write_tum
 from lslam.maps.octree import points_of
 from lslam.pipeline.map_files import MapNote, georeference_note, write_map
 from lslam.pipeline.rebuild import viewed_run

@@ -6,7 +6,7 @@ from math import inf
 
 import pytest
 
-from lslam.evaluation.beside import difficulty, judge_number, judge_order, judge_time, spread
+from lslam.evaluation.thesis import difficulty, judge_number, judge_order, judge_time, median_and_worst
 
 
 @pytest.mark.parametrize(
@@ -61,8 +61,8 @@ def test_hardness_and_the_worst() -> None:
     assert difficulty([(1.0, [1.0]), (8.0, [2.0])]) == "partly as hard"
     assert difficulty([(None, [1.0]), (8.0, [2.0])]) == "easier"
     assert difficulty([(1.0, []), (None, [2.0])]) == ""
-    assert spread([0.3, 0.1, 0.2, 0.4]) == (0.25, 0.4)
-    assert spread([0.3, inf]) == (inf, inf)
+    assert median_and_worst([0.3, 0.1, 0.2, 0.4]) == (0.25, 0.4)
+    assert median_and_worst([0.3, inf]) == (inf, inf)
 
 
 @pytest.mark.parametrize(

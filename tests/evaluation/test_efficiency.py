@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lslam.evaluation.curves import efficiency, median_over_seeds, normalise, over_seeds, two_sided
+from lslam.evaluation.curves import efficiency, median_over_seeds, normalise, over_seeds, t_half_width
 
 # Its open flight (tables 4.13 and 5.3): rmse m, angular rmse deg, s of registration per scan (LOAM and map added), s in all.
 OPEN = {
@@ -49,7 +49,7 @@ def test_students_quantiles_are_those_of_scipy() -> None:
 
     freedom = np.array([1, 2, 3, 10, 1000])
     for level in (0.5, 0.95, 0.99):
-        assert two_sided(level, freedom) == pytest.approx(student.ppf(0.5 + level / 2, freedom), rel=1e-9)
+        assert t_half_width(level, freedom) == pytest.approx(student.ppf(0.5 + level / 2, freedom), rel=1e-9)
 
 
 def test_interval_over_seeds_holds_the_truth_as_often_as_it_says() -> None:

@@ -17,7 +17,7 @@ from lslam.core.types.sequence import Calibration
 from lslam.core.types.trajectory import Trajectory
 from lslam.evaluation.evaluate import Evaluation, evaluate
 from lslam.evaluation.frames import R_BODY_CAMERA, body_rotation, main_axis
-from lslam.io.formats.calibration_files import read_odometry_calib
+from lslam.io.formats.kitti_layout import read_odometry_calib
 from lslam.io.formats.trajectory_files import read_trajectory
 
 T_CAM_LIDAR = se3.make(R_BODY_CAMERA.T @ so3.exp(np.array([0.01, -0.02, 0.015])), np.array([-0.005, -0.07, -0.33]))

@@ -52,7 +52,7 @@ def test_a_turn_is_found_in_spite_of_noise_and_a_lever_arm(axis: int, degrees: f
     assert found is not None
     np.testing.assert_allclose(np.rad2deg(found.rotation), wanted, atol=0.6)
     assert np.rad2deg(found.sigma) < 0.8
-    assert found.squared > 30.7
+    assert found.mahalanobis2 > 30.7
 
 
 def test_without_noise_it_is_exact_and_lever_arms_are_no_turn() -> None:
@@ -72,7 +72,7 @@ def test_noise_alone_is_no_turn(seed: int) -> None:
     truth = drive(150)
     found = body_turn(noisy(truth, 0.08, 0.3, seed), truth)
     assert found is not None
-    assert found.squared < 16, "chi-square of three, once in a thousand"
+    assert found.mahalanobis2 < 16, "chi-square of three, once in a thousand"
 
 
 def test_unobserved_rotations_are_not_estimated() -> None:
@@ -82,9 +82,9 @@ def test_unobserved_rotations_are_not_estimated() -> None:
     roll, yaw = (body_turn(odometry, turned(truth, v)) for v in (np.array([20.0, 0, 0]), np.array([0, 0, 5.0])))
     assert roll is not None
     assert yaw is not None
-    assert roll.squared < 16
+    assert roll.mahalanobis2 < 16
     assert np.rad2deg(np.sqrt(roll.covariance[0, 0])) > 2.0
-    assert yaw.squared > 30.7
+    assert yaw.mahalanobis2 > 30.7
     assert body_turn(truth[:20], truth[:20]) is None, "20 m are no way"
     assert body_turn(truth[[0] * 300], truth[[0] * 300]) is None, "nor is standing for long"
     still = body_turn(truth, truth)
@@ -96,7 +96,7 @@ def test_poses_that_are_missing_in_the_middle_are_no_turn() -> None:
     truth = drive(200)
     found = body_turn(truth[:160], np.concatenate([truth[:100], truth[140:]]))
     assert found is not None
-    assert found.squared < 16
+    assert found.mahalanobis2 < 16
 
 
 def test_the_evaluation_says_so_once_and_names_the_angle(caplog: pytest.LogCaptureFixture) -> None:

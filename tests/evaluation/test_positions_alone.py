@@ -14,7 +14,8 @@ from lslam.core.errors import InputError
 from lslam.core.geometry import se3
 from lslam.core.types.trajectory import Trajectory
 from lslam.evaluation.evaluate import evaluate
-from lslam.io.formats.trajectory_files import read_trajectory, write_tum
+from lslam.io.formats.trajectory_files import read_trajectory
+from lslam.io.formats.trajectory_lines import write_tum
 
 COUNT = 120
 NS = 1_700_000_000_000_000_000 + np.arange(COUNT) * 100_000_000

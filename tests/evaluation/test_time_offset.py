@@ -15,7 +15,7 @@ from lslam.core.geometry.se3 import poses_at
 from lslam.core.types.trajectory import Trajectory
 from lslam.evaluation.evaluate import evaluate
 from lslam.evaluation.time_offset import fit_offset
-from lslam.io.formats.trajectory_files import write_tum
+from lslam.io.formats.trajectory_lines import write_tum
 
 SCANS, STEP_NS = 300, 100_000_000
 Floats = np.ndarray

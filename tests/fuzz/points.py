@@ -14,9 +14,8 @@ from fuzz.cases import Files, Parser
 from point_writers import packed, revolution, write_pcd
 
 from lslam.core.types.cloud import ArrayCloud
-from lslam.io.formats.ply_files import write_ply
-from lslam.io.formats.point_files import read_cloud, read_points, write_cloud
-from lslam.io.formats.pointcloud2 import decode_livox, decode_pointcloud2
+from lslam.io.formats.point_files import read_cloud, read_points, write_cloud, write_ply
+from lslam.io.formats.sensor_messages import decode_livox, decode_pointcloud2
 from lslam.io.formats.state_files import read_npz, write_npz
 
 _N = 30

@@ -18,25 +18,24 @@ from lslam.core.config.study import read_batch, read_study
 from lslam.core.errors import LslamError
 from lslam.core.types.study import StudyRow
 from lslam.evaluation.timing import read_timing
-from lslam.io.formats.calibration_files import read_cam0_lidar, read_mcd_extrinsics, read_transform
 from lslam.io.formats.geojson import read_line
-from lslam.io.formats.kitti_layout import read_oxts
+from lslam.io.formats.kitti_layout import read_cam0_lidar, read_mcd_extrinsics, read_oxts, read_transform
 from lslam.io.formats.osm_buildings import read_buildings
 from lslam.io.formats.sequence_toml import read_sequence_toml
 from lslam.io.formats.stamped_csv import read_gnss_csv, read_imu_csv
 from lslam.io.formats.state_files import read_state, write_state
-from lslam.io.formats.time_columns import read_stamps
-from lslam.io.formats.trajectory_files import read_times, read_trajectory
+from lslam.io.formats.time_columns import read_stamps, read_times
+from lslam.io.formats.trajectory_files import read_trajectory
 from lslam.io.readers.scan_stamps import stamps_in_names
 from lslam.osm.bounds import Bounds
 from lslam.osm.buildings_geojson import read_buildings_geojson
 from lslam.osm.overpass import kept_reply
 from lslam.pipeline.rebuild import map_of, read_run, viewed_run
 from lslam.pipeline.resume import may_go_on
-from lslam.simulation.osm_perturb import read_perturbation
+from lslam.simulation.osm_extract import read_perturbation
 from lslam.simulation.record import read_mark
 from lslam.simulation.routes import read_way_points
-from lslam.simulation.scenario_files import scenario_named
+from lslam.simulation.scenario_files import find_scenario
 from lslam.studies import results_csv
 from lslam.studies.results_csv import read_study_csv, write_study_csv
 
@@ -269,7 +268,7 @@ PARSERS = [
     _text_parser("preset", "p.toml", lambda p: load_config(None, [f"odometry.preset={p}"]), _PRESET),
     _text_parser("study", "s.toml", lambda p: read_study(p).points(), _STUDY),
     _text_parser("batch", "b.toml", read_batch, _BATCH),
-    _text_parser("scenario", "s.toml", lambda p: scenario_named(str(p)), _SCENARIO),
+    _text_parser("scenario", "s.toml", lambda p: find_scenario(str(p)), _SCENARIO),
     _text_parser("way-points, TOML", "w.toml", read_way_points, "points = [[0, 0], [5.5, 0], [5, 5], [0, 5]]\nclosed = true\n"),
     _text_parser("way-points, csv", "w.csv", read_way_points, "x,y\n0,0\n50,0\n50,50\n", "0,0\n10,10\n20,20\n"),
     _text_parser("way-points, GeoJSON", "w.geojson", read_way_points, _LINE),

@@ -172,5 +172,5 @@ def test_what_any_beam_met_is_not_gone() -> None:
     """As foliage, which most beams pass: the cells are free in the end."""
     found = drive(box=lambda k: k == 8)
     free = found.log_odds <= MODEL[2]
-    assert (free & found.was_hit).sum() > 10
+    assert (free & found.has_hits).sum() > 10
     assert differences(found, np.concatenate([WALL, FLOOR, FRONT])) == ()

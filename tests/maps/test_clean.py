@@ -11,8 +11,8 @@ from lslam.core.config import load_config
 from lslam.core.geometry import se3, so3
 from lslam.core.types.scan_result import ScanResult
 from lslam.maps import clean
-from lslam.maps.clean import CUBE, OFFSETS, SHARE, Cleaner, PosedScan, spread
-from lslam.maps.kernels.see_through import nearest_ranges, vote
+from lslam.maps.clean import CUBE, OFFSETS, SHARE, Cleaner, PosedScan, extend_to_cubes
+from lslam.maps.kernels.views import nearest_ranges, vote
 from lslam.odometry.inertial.constant_velocity import Course
 from lslam.pipeline.map_pass import build_map, motion_within
 from lslam.registration.preprocessing.deskew import deskew_points
@@ -174,7 +174,7 @@ def test_cubes_with_a_good_share_of_moving_points_go_whole() -> None:
         if moves[inside].sum() >= max(2, SHARE * inside.sum()):
             expected |= inside
     assert (expected & ~moves).sum() > 200
-    assert np.array_equal(spread(moves, points), expected)
+    assert np.array_equal(extend_to_cubes(moves, points), expected)
 
 
 def test_scans_come_back_in_order_and_late() -> None:

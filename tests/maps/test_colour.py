@@ -8,8 +8,7 @@ from lslam.core.geometry import se3
 from lslam.core.types.arrays import Floats
 from lslam.core.types.camera import Image, Lens
 from lslam.core.types.cloud import ArrayCloud
-from lslam.maps.colour import GREY, VIEWS, ColouredCloud, MapColourer
-from lslam.maps.exposure import image_gains
+from lslam.maps.colour import GREY, VIEWS, ColouredCloud, MapColourer, image_gains
 
 LENS = Lens("pinhole", (200, 160), (120.0, 120.0, 99.5, 79.5))
 SPACING = 0.2

@@ -168,7 +168,7 @@ def test_other_layouts_and_types_are_accepted() -> None:
 
 
 def test_warm_up_compiles_all_that_a_run_needs() -> None:
-    from lslam.maps.kernels.voxel_average import accumulate, enter
+    from lslam.maps.kernels.cells import accumulate, enter
 
     warm_up()
     scans = make_scans(2, 200_000)

@@ -79,7 +79,7 @@ def test_equal_keys_keep_the_order_of_the_runs(tmp_path: Path) -> None:
         seen.extend(rows.tolist())
         return rows[:1]
 
-    runs.combined(keep)
+    runs.merge(keep)
     assert seen == sorted([[key, k] for k in range(5) for key in range(k, 40, 3)])
 
 
@@ -96,7 +96,7 @@ def test_rows_are_divided_into_parts_that_fit(tmp_path: Path, monkeypatch: pytes
         sizes.append(len(rows))
         return rows
 
-    whole = runs.combined(count)
+    whole = runs.merge(count)
     assert len(whole) == sum(sizes) == 30_000
     assert max(sizes) < 2500
     keys = whole.read(0, len(whole))[:, 0]

@@ -18,7 +18,8 @@ from lslam.core.types.trajectory import Trajectory
 from lslam.evaluation.evaluate import evaluate
 from lslam.evaluation.metric import Evaluation
 from lslam.evaluation.relative import by_index, by_path, error_transforms
-from lslam.io.formats.trajectory_files import read_trajectory, write_tum
+from lslam.io.formats.trajectory_files import read_trajectory
+from lslam.io.formats.trajectory_lines import write_tum
 
 GOLDEN = json.loads(make_golden.GOLDEN.read_text())
 CONFIG = EvalConfig(align=make_golden.ALIGNMENTS, delta=make_golden.DELTAS)

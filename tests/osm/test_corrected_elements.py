@@ -63,7 +63,7 @@ def test_neighbours_that_move_together_keep_their_nodes() -> None:
     check_moved(data, after, "way/1", d)
     check_moved(data, after, "way/2", d)
     assert after.ways == {1: data.ways[1], 2: data.ways[2]}
-    assert after.modified == {("node", n) for n in (1, 2, 3, 4, 5, 6)}
+    assert after.edits == {("node", n) for n in (1, 2, 3, 4, 5, 6)}
 
 
 def test_neighbours_that_part_share_no_node_any_more() -> None:
@@ -76,10 +76,10 @@ def test_neighbours_that_part_share_no_node_any_more() -> None:
     new = set(after.ways[1].nodes) - set(data.ways[1].nodes)
     assert len(new) == 2
     assert all(n < 0 for n in new)
-    assert after.ways[1].is_closed
+    assert after.ways[1].is_ring
     assert after.ways[1].tags == data.ways[1].tags
-    assert ("way", 1) in after.modified
-    assert ("way", 2) not in after.modified
+    assert ("way", 1) in after.edits
+    assert ("way", 2) not in after.edits
 
 
 def test_a_neighbour_that_was_not_corrected_is_not_dragged_along() -> None:
@@ -88,7 +88,7 @@ def test_a_neighbour_that_was_not_corrected_is_not_dragged_along() -> None:
     check_moved(data, after, "way/1", d)
     assert set(after.ways) == {1}
     assert after.nodes[2] == data.nodes[2]
-    assert ("node", 2) not in after.modified
+    assert ("node", 2) not in after.edits
     assert len([n for n in after.ways[1].nodes if n < 0]) == 2
 
 
@@ -113,7 +113,7 @@ def test_a_member_that_is_no_outline_and_that_the_border_cuts_is_left_out() -> N
 
 def test_what_stays_is_not_edited() -> None:
     after = correct(pair(), {"way/4": (0.0, 0.0, 0.0), "way/1": (0.004, 0.0, 0.0)})
-    assert after.modified == set()
+    assert after.edits == set()
     assert after.nodes[9] == pair().nodes[9]
 
 

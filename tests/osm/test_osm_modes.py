@@ -26,7 +26,7 @@ from lslam.io.formats.trajectory_files import read_trajectory
 from lslam.osm import location
 from lslam.osm.buildings_geojson import read_buildings_geojson
 from lslam.osm.track import OsmTrack
-from lslam.simulation.osm_perturb import read_perturbation
+from lslam.simulation.osm_extract import read_perturbation
 
 Floats = NDArray[np.float64]
 
@@ -76,7 +76,7 @@ def test_displaced_buildings_are_nearer_to_their_true_places(two_level: Path) ->
 def test_the_change_file_holds_the_corrected_outlines(two_level: Path) -> None:
     corrected = read_buildings_geojson(two_level / "buildings.geojson")
     edited = read_osm(two_level / "buildings.osm")
-    assert edited.modified
+    assert edited.edits
     assert {w for w in edited.ways if w < 0} <= set(read_osm(DRIVE / "map_perturbed.osm").ways)
     outlines = {b.osm_id: b for b in buildings_of(edited, corrected.origin).buildings}
     assert set(outlines) == {c.building.osm_id for c in corrected.buildings}

@@ -19,8 +19,7 @@ from lslam.io.formats.osm_buildings import read_buildings
 from lslam.io.formats.osm_files import write_osm
 from lslam.io.formats.trajectory_files import read_trajectory
 from lslam.osm.buildings_geojson import read_buildings_geojson
-from lslam.simulation.osm_extract import osm_from_buildings
-from lslam.simulation.osm_perturb import Change, Perturbation, perturb
+from lslam.simulation.osm_extract import Change, Perturbation, osm_from_buildings, perturb
 
 Floats = NDArray[np.float64]
 

@@ -23,7 +23,7 @@ CONFIG = load_config(settings=["map.colour=true"], environ={})
 def drive() -> SimulatedDrive:
     """A drive round a block with its camera, whose exposure and noise are off."""
     made = simulate("block", lidar="hdl64", count=8, motion_compensated=True)
-    camera = SimulatedCamera(made, CameraModel(noise=0.0, exposure_spread=0.0)).camera
+    camera = SimulatedCamera(made, CameraModel(noise=0.0, exposure_sigma=0.0)).camera
     images = [camera.image(k) for k in range(len(camera.stamps_ns))]
     object.__setattr__(camera, "load", images.__getitem__)
     made.cameras = lambda: [camera]  # type: ignore[attr-defined]

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from lslam.core.config import load_config
 from lslam.core.errors import UsageError
-from lslam.io.formats.ply_files import write_ply
-from lslam.io.formats.point_files import read_points
+from lslam.io.formats.point_files import read_points, write_ply
 from lslam.pipeline.check import check_config
 from lslam.pipeline.run import run
 from lslam.reports.text import summary

@@ -24,7 +24,7 @@ SPARSE, SCANS = ("input.skip_frames=2", "keyframes.distance=4", "registration.st
 # Who asks in a run that does everything: what takes long where a recording is long.
 ASKERS = (
     "estimate", "find", "floor_planes", "_voted_out", "solve", "marginal_blocks", "_along", "sightings",
-    "finish", "agreeing", "absent_buildings", "new_walls", "remove_overlaps", "scans_again", "combined", "_pieces", "make_report",
+    "finish", "agreeing", "absent_buildings", "new_walls", "remove_overlaps", "scans_again", "merge", "_pieces", "make_report",
 )  # fmt: skip
 
 
@@ -151,7 +151,7 @@ def test_a_stop_in_graph_buildings_or_map_interrupts_and_resumes_to_the_same_byt
 ) -> None:
     counts = Counter(whole_of_all[1])
     # In the solver and its covariances, the run without buildings is stopped.
-    askers = ("_along", "agreeing", "new_walls", "combined", "_pieces")
+    askers = ("_along", "agreeing", "new_walls", "merge", "_pieces")
     stops = [(asker, counts[asker] // 2) for asker in askers]
     assert_goes_on(everything, whole_of_all[0], tmp_path / "out", OF_ALL, stops)
 

@@ -93,7 +93,7 @@ def test_several_are_a_list(result: Evaluation, unavailable: Evaluation) -> None
 
 
 def test_text_table_names_every_recipe(result: Evaluation) -> None:
-    text = evaluations.render([replace(result, shown=("thesis",))], [TIMING])
+    text = evaluations.render([replace(result, words=("thesis",))], [TIMING])
     assert "thesis" not in evaluations.render([result], [TIMING])
     ate = result.ate["se3"].translation
     assert ate is not None

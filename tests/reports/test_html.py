@@ -141,7 +141,7 @@ def test_every_chart_is_well_formed_and_inside_its_box(make_record: MakeRecord) 
 
 def test_values_and_recipes_stand_on_the_page(make_record: MakeRecord) -> None:
     record = make_record(90)
-    evaluation = replace(scored(record), shown=("thesis",))
+    evaluation = replace(scored(record), words=("thesis",))
     text = parse(render_report(record, evaluation)).text
     assert "thesis" not in parse(render_report(record, scored(record))).text
     for alignment in ("se3", "origin"):

@@ -33,7 +33,7 @@ def test_scores_stand_with_their_recipes(make_record: MakeRecord) -> None:
     assert record.ground_truth is not None
     evaluation = evaluate(record.trajectory, record.ground_truth, EvalConfig(metrics=("thesis",)))
     text = summary(record, evaluation)
-    assert "thesis" not in summary(record, replace(evaluation, shown=()))
+    assert "thesis" not in summary(record, replace(evaluation, words=()))
     se3 = evaluation.ate["se3"].translation
     assert se3 is not None
     found = lines(text)

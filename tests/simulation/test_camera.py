@@ -25,7 +25,7 @@ def drive() -> SimulatedDrive:
 
 
 def test_points_of_a_scan_are_where_the_camera_sees_their_surface(drive: SimulatedDrive) -> None:
-    camera = SimulatedCamera(drive, replace(SMALL, exposure_s=0.0, instants=1, exposure_spread=0.0))
+    camera = SimulatedCamera(drive, replace(SMALL, exposure_s=0.0, instants=1, exposure_sigma=0.0))
     scan = drive.scan(1)
     stamp = scan.stamp_ns / 1e9
     T_camera_lidar = se3.inverse(camera.T_lidar_camera)
@@ -44,11 +44,11 @@ def test_points_of_a_scan_are_where_the_camera_sees_their_surface(drive: Simulat
 
 
 def test_an_image_has_the_colours_of_surfaces_and_blur_mixes_them(drive: SimulatedDrive) -> None:
-    sharp = SimulatedCamera(drive, replace(SMALL, instants=1, exposure_spread=0.0)).image(0)
+    sharp = SimulatedCamera(drive, replace(SMALL, instants=1, exposure_sigma=0.0)).image(0)
     known = {tuple(colour) for colour in COLOURS.astype(int).tolist()}
     assert {tuple(colour) for colour in sharp.reshape(-1, 3).tolist()} <= known
     assert len({tuple(colour) for colour in sharp.reshape(-1, 3).tolist()}) > 3
-    blurred = SimulatedCamera(drive, replace(SMALL, exposure_s=0.2, exposure_spread=0.0)).image(1)
+    blurred = SimulatedCamera(drive, replace(SMALL, exposure_s=0.2, exposure_sigma=0.0)).image(1)
     assert not {tuple(colour) for colour in blurred.reshape(-1, 3).tolist()} <= known
 
 

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from lslam.core.errors import UsageError
 from lslam.core.geometry import se3
+from lslam.simulation.curve import rolling
 from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 from lslam.simulation.scene_mesh import Surface
-from lslam.simulation.terrain import rolling
 
 Floats = NDArray[np.float64]
 SEEDS = (0, 1, 2)

@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 
 from lslam.core.geometry import se3, so3
-from lslam.simulation.curve import RouteCurve, smooth_curve, stretched
-from lslam.simulation.flight import GRAVITY, FreePath, buffeting, climb_spline, fly, gait
-from lslam.simulation.path import SpeedProfile
-from lslam.simulation.terrain import rolling
+from lslam.simulation.curve import RouteCurve, rolling, smooth_curve, stretch
+from lslam.simulation.path import GRAVITY, FreePath, SpeedProfile, buffeting, climb_spline, fly, gait
 
 STEADY = SpeedProfile(8.0, 8.0, lateral=1e6)
 CALM = buffeting(np.random.default_rng(0), 0.0)
@@ -83,9 +81,9 @@ def test_a_walker_looks_about_fast_and_stays_above_the_ground() -> None:
 
 def test_stretching_an_open_curve_goes_straight_on() -> None:
     line = smooth_curve(np.array([[0.0, 0.0], [50.0, 0.0], [80.0, 40.0]]), closed=False)
-    longer = stretched(line, 40.0)
+    longer = stretch(line, 40.0)
     assert longer.length == pytest.approx(line.length + 80, abs=0.2)
     np.testing.assert_allclose(longer.position(np.array([0.0]))[0], [-40.0, 0.0], atol=0.1)
     ends = longer.position(np.array([40.0, longer.length - 40.0]))
     np.testing.assert_allclose(ends, line.position(np.array([0.0, line.length])), atol=0.1)
-    assert stretched(circle(30.0), 40.0).length == circle(30.0).length
+    assert stretch(circle(30.0), 40.0).length == circle(30.0).length

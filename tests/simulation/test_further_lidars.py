@@ -16,7 +16,7 @@ from lslam.io.formats.sequence_toml import read_sequence_toml
 from lslam.io.readers import open_sequence
 from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.record import MANIFEST, record
-from lslam.simulation.scenario_files import parse_scenario, scenario_named, scenario_text
+from lslam.simulation.scenario_files import find_scenario, parse_scenario, scenario_text
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 
 SHARES_TOWNS = True
@@ -139,7 +139,7 @@ def test_one_scan_leaves_none_for_a_lidar_that_begins_later() -> None:
 
 
 def test_a_scenario_with_two_lidars_is_ready_and_reads_back_from_its_text() -> None:
-    scenario = scenario_named("two-lidars")
+    scenario = find_scenario("two-lidars")
     assert [mount.name for mount in scenario.lidars] == ["rear"]
     from lslam.core.untrusted import parse_toml
 

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from lslam.simulation.built_scenario import build_scenario
 from lslam.simulation.imu import IMUS, ImuFaults
-from lslam.simulation.scenario_files import parse_scenario, scenario_named, scenario_names
+from lslam.simulation.scenario_files import find_scenario, parse_scenario, scenario_names
 from lslam.simulation.scenarios import simulate
 from lslam.simulation.scene_mesh import Surface
 
@@ -22,7 +22,7 @@ PAIRS = {name: f"{name}-hard" for name in ("urban", "residential", *FLIGHTS)}
 
 @pytest.mark.parametrize("name", PAIRS)
 def test_a_hard_scenario_goes_the_way_of_its_clean_one(name: str) -> None:
-    plain, hard = scenario_named(name), scenario_named(PAIRS[name])
+    plain, hard = find_scenario(name), find_scenario(PAIRS[name])
     ways = ("carrier", "lidar", "speed", "start_speed", "lateral", "path", "motion_compensated", "overlap")
     assert {key: getattr(plain, key) for key in ways} == {key: getattr(hard, key) for key in ways}
     assert plain.real_returns is None
@@ -35,19 +35,19 @@ def test_a_hard_scenario_goes_the_way_of_its_clean_one(name: str) -> None:
 
 def test_own_files_may_stand_on_a_hard_scenario() -> None:
     own = parse_scenario("own", {"base": "urban-hard", "returns": {"grass": 0.2}})
-    hard = scenario_named("urban-hard")
+    hard = find_scenario("urban-hard")
     assert own.returns == hard.returns.model_copy(update={"grass": 0.2})
     assert own.model_copy(update={"name": hard.name, "returns": hard.returns}) == hard
 
 
 def test_only_hard_worlds_and_woods_have_real_returns() -> None:
-    asked = {name for name in scenario_names() if scenario_named(name).real_returns is not None}
+    asked = {name for name in scenario_names() if find_scenario(name).real_returns is not None}
     assert asked == {*PAIRS.values(), "park", "forest-road"}
 
 
 @pytest.mark.parametrize("name", ["park", "forest-road"])
 def test_in_woods_leaves_are_everywhere_but_on_the_way(name: str) -> None:
-    scenario = scenario_named(name)
+    scenario = find_scenario(name)
     place = build_scenario(scenario, 1, count=50)
     mesh, street = place.city.mesh, place.city.street
     assert street is not None

@@ -19,7 +19,7 @@ from lslam.simulation.imu import (
     ImuModel,
     SimulatedImu,
     Triad,
-    imu_named,
+    find_imu,
     measure,
     simulate_imu,
 )
@@ -262,10 +262,10 @@ def test_same_seed_same_readings_and_more_time_only_adds(laps: SimulatedDrive) -
 
 
 def test_models_by_name() -> None:
-    assert imu_named("icm20948") is ICM
+    assert find_imu("icm20948") is ICM
     assert ICM.rate_hz == 100
     with pytest.raises(UsageError, match="did you mean 'icm20948'"):
-        imu_named("icm20984")
+        find_imu("icm20984")
 
 
 def test_a_drive_carries_it_only_when_asked(laps: SimulatedDrive) -> None:

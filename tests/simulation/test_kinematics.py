@@ -63,14 +63,14 @@ def test_closed_form_of_a_tumbling_flight() -> None:
     # A lever arm on a body that spins evenly is pulled towards the axis.
     arm = T_ARM[:3, 3]
     pull = np.einsum("nij,j->ni", k.poses[:, :3, :3], np.cross(w, np.cross(w, arm)))
-    np.testing.assert_allclose(k.carried(T_ARM).acceleration - k.acceleration, pull, atol=1e-3)
-    np.testing.assert_allclose(k.carried(T_ARM).rate, np.tile(w @ T_ARM[:3, :3], (300, 1)), atol=1e-7)
+    np.testing.assert_allclose(k.at_sensor(T_ARM).acceleration - k.acceleration, pull, atol=1e-3)
+    np.testing.assert_allclose(k.at_sensor(T_ARM).rate, np.tile(w @ T_ARM[:3, :3], (300, 1)), atol=1e-7)
 
 
 @pytest.mark.parametrize("T_body_sensor", [np.eye(4), T_ARM], ids=["lidar", "with a lever arm"])
 def test_kinematics_are_the_derivatives_of_the_poses(street: Motion, T_body_sensor: Floats) -> None:
     t = np.linspace(0.1, street.duration - 0.1, 500)
-    exact, differences = street.at(t).carried(T_body_sensor), numeric(street, t, T_body_sensor)
+    exact, differences = street.at(t).at_sensor(T_body_sensor), numeric(street, t, T_body_sensor)
     np.testing.assert_allclose(exact.poses, differences.poses, atol=1e-12)
     np.testing.assert_allclose(exact.velocity, differences.velocity, atol=1e-6)
     np.testing.assert_allclose(exact.acceleration, differences.acceleration, atol=1e-4)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from lslam.core.errors import UsageError
 from lslam.core.geometry import se3, so3
 from lslam.simulation.lidar import trace
-from lslam.simulation.lidar_models import LIDARS, LidarModel, lidar_named
+from lslam.simulation.lidar_models import LIDARS, LidarModel, find_lidar
 from lslam.simulation.scene_mesh import MeshBuilder, RayScene, SceneMesh, Surface
 
 # A LiDAR without faults, so that answers are exact.
@@ -240,4 +240,4 @@ def test_ready_models_are_what_they_are_called() -> None:
     assert LIDARS["os1-32"].rays == 32 * 1024
     assert all(np.all(np.diff(m.elevations_deg) < 0) for m in LIDARS.values())
     with pytest.raises(UsageError, match="did you mean 'hdl64'"):
-        lidar_named("hdl46")
+        find_lidar("hdl46")

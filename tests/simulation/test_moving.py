@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lslam.simulation.curve import smooth_curve
+from lslam.simulation.curve import flat, rolling, smooth_curve
 from lslam.simulation.lidar import MovingMesh, Roof, trace
 from lslam.simulation.lidar_models import LIDARS, LidarModel
 from lslam.simulation.moving import NEAREST_M, Mover, add_traffic, moving_meshes, pedestrian
+from lslam.simulation.scenario_files import TrafficSection
 from lslam.simulation.scenarios import simulate
 from lslam.simulation.scene_mesh import MeshBuilder, RayScene, SceneMesh, Surface
-from lslam.simulation.terrain import flat, rolling
 
 PERFECT = LidarModel("perfect", (2.0, 0.0, -2.0), 3600, 0.1, 500.0, 0.0, 1e-6, 0.0, 1e6, 0.0)
 
@@ -251,8 +251,8 @@ def test_traffic_keeps_clear_of_the_line() -> None:
         T[:, 0, 3], T[:, 1, 3], T[:, 2, 3] = 10.0 * np.asarray(times), -1.2, 1.7
         return T
 
-    movers = add_traffic([street], flat(), line, 30.0, np.random.default_rng(5), cars_per_km=200, people_per_km=100,
-                         lanes=(1.7, -1.2), pavement=6.0, speed=8.0)  # fmt: skip
+    traffic = TrafficSection(cars=200, people=100, lanes=(1.7, -1.2), speed=8.0)
+    movers = add_traffic([street], flat(), line, 30.0, np.random.default_rng(5), traffic, 6.0)
     assert len(movers) > 20
     times = np.arange(0, 30, 0.05)
     for mover in movers:

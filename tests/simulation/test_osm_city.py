@@ -15,11 +15,10 @@ from shapely import MultiPolygon, contains_xy, points
 
 from lslam.core.errors import InputError
 from lslam.core.types.building import Building, Footprint, footprint_polygon
-from lslam.simulation.curve import smooth_curve
+from lslam.simulation.curve import flat, rolling, smooth_curve
 from lslam.simulation.osm_city import OsmCity, build_osm_city, extrude
 from lslam.simulation.osm_place import read_extract
 from lslam.simulation.scene_mesh import MeshBuilder, RayScene, Surface
-from lslam.simulation.terrain import flat, rolling
 
 ORIGIN = np.array([49.0112, 8.4229, 112.8])
 

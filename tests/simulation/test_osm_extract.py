@@ -20,24 +20,27 @@ from lslam.io.formats.osm_buildings import buildings_of
 from lslam.io.formats.osm_data import ATTRIBUTION
 from lslam.io.formats.osm_files import read_osm, write_osm
 from lslam.simulation.city import City
+from lslam.simulation.curve import flat, rolling
 from lslam.simulation.osm_city import build_osm_city
-from lslam.simulation.osm_extract import Extracts, city_buildings, osm_from_buildings, write_extracts
-from lslam.simulation.osm_perturb import (
+from lslam.simulation.osm_extract import (
     Change,
+    Extracts,
     MapFaults,
+    city_buildings,
     draw_perturbation,
+    osm_from_buildings,
     perturb,
     read_perturbation,
+    write_extracts,
     write_perturbation,
 )
 from lslam.simulation.osm_place import read_extract
 from lslam.simulation.scenarios import simulate
 from lslam.simulation.scene_mesh import Surface
-from lslam.simulation.terrain import flat, rolling
 
 ORIGIN = np.array([49.0112, 8.4229, 112.8])
 CM = 0.01
-NONE = MapFaults(0.0, shifted=0, turned=0, simplified=0, merged=0, missing=0, new=0)
+NONE = MapFaults(0.0, shift_share=0, turn_share=0, simplify_share=0, merge_share=0, missing=0, new=0)
 
 
 def rectangle(x: float, y: float, width: float, depth: float) -> NDArray[np.float64]:
@@ -150,7 +153,7 @@ def test_every_kind_of_fault_is_there_and_each_building_is_on_record() -> None:
         "simplified": sum(c.simplify_m > 0 for c in p.changes),
         "turned": sum(c.turn_rad != 0 for c in p.changes),
         "shifted": sum(c.shift_m != (0, 0) for c in p.changes),
-        "new": len(p.not_yet_built),
+        "new": len(p.future_buildings),
     }
     assert counts.pop("simplified") in range(3, 7)
     assert counts == {"missing": 3, "merged": 2, "swallowed": 2, "turned": 5, "shifted": 10, "new": 2}
@@ -172,7 +175,7 @@ def test_a_shifted_map_is_shifted_and_nothing_else() -> None:
 
 def test_turned_shifted_and_simplified_buildings_against_shapely() -> None:
     """shapely's own rotation, translation and simplification give the same outlines."""
-    faults = replace(NONE, turned=0.5, shifted=0.5, simplified=0.2)
+    faults = replace(NONE, turn_share=0.5, shift_share=0.5, simplify_share=0.2)
     p = draw_perturbation(village(), faults, np.random.default_rng(1))
     assert any(c.turn_rad and c.simplify_m for c in p.changes)
     after = {b.osm_id: polygon(b) for b in perturb(village(), p)}
@@ -188,7 +191,7 @@ def test_turned_shifted_and_simplified_buildings_against_shapely() -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_what_moves_a_drawn_building_back_moves_it_to_where_it_stands(seed: int) -> None:
     exact = village()
-    drawn = draw_perturbation(exact, MapFaults(2.0, simplified=0, merged=0), np.random.default_rng(seed))
+    drawn = draw_perturbation(exact, MapFaults(2.0, simplify_share=0, merge_share=0), np.random.default_rng(seed))
     on_map, errors = {b.osm_id: b for b in perturb(exact, drawn)}, map_errors(exact, drawn)
     assert set(errors) == {c.id for c in drawn.changes if not c.missing}
     assert sum(abs(e[2]) > 0.001 for e in errors.values()) > 1
@@ -201,14 +204,14 @@ def test_what_moves_a_drawn_building_back_moves_it_to_where_it_stands(seed: int)
 
 def test_long_buildings_are_turned_by_less() -> None:
     hall = Building("way/1", (Footprint(rectangle(0, 0, 200, 20)),), 9.0)
-    p = draw_perturbation([hall], replace(NONE, turned=1.0), np.random.default_rng(0))
+    p = draw_perturbation([hall], replace(NONE, turn_share=1.0), np.random.default_rng(0))
     (after,) = perturb([hall], p)
     moved = np.linalg.norm(after.footprints[0].outer - hall.footprints[0].outer, axis=1)
     assert 0.4 < moved.max() < 2.0
 
 
 def test_missing_and_merged_buildings_are_gone_and_their_ground_is_accounted_for() -> None:
-    faults = replace(NONE, missing=0.2, merged=0.2)
+    faults = replace(NONE, missing=0.2, merge_share=0.2)
     p = draw_perturbation(village(), faults, np.random.default_rng(0))
     known = {b.osm_id: b for b in village()}
     after = {b.osm_id: b for b in perturb(village(), p)}
@@ -229,7 +232,7 @@ def test_missing_and_merged_buildings_are_gone_and_their_ground_is_accounted_for
 def test_buildings_not_yet_built_stand_on_free_ground(block: City, tmp_path: Path) -> None:
     faults = replace(NONE, new=0.3)
     extracts = write_extracts(tmp_path, block, ORIGIN, np.random.default_rng(0), faults)
-    new = extracts.perturbation.not_yet_built
+    new = extracts.perturbation.future_buildings
     assert len(new) >= 3
     exact = union_all([polygon(b) for b in read_map(extracts.exact)])
     assert block.street is not None

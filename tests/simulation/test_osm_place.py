@@ -24,7 +24,7 @@ from lslam.simulation.osm_city import OsmCity
 from lslam.simulation.osm_place import DRIVABLE, WALKABLE, buildings_near, find_route, highways, read_extract
 from lslam.simulation.record import record
 from lslam.simulation.routes import WayPoints
-from lslam.simulation.scenario_files import scenario_named
+from lslam.simulation.scenario_files import find_scenario
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 from lslam.simulation.scene_mesh import Surface
 
@@ -183,7 +183,7 @@ def test_a_generated_town_lies_where_its_degrees_or_the_origin_say(tmp_path: Pat
 
 
 def test_a_shape_is_laid_between_the_houses(extract: Path) -> None:
-    bend = WayPoints(np.array([[0.0, 0.0], [150.0, 0.0], [150.0, 100.0]]), is_placed=False)
+    bend = WayPoints(np.array([[0.0, 0.0], [150.0, 0.0], [150.0, 100.0]]), has_place=False)
     made = simulate("residential", osm=extract, way_points=bend, count=20, settings=["path.smoothing=6"])
     line = made.city_poses[:, :2, 3]
     assert np.asarray(distance(points(line), WALLS)).min() > 2.0
@@ -192,7 +192,7 @@ def test_a_shape_is_laid_between_the_houses(extract: Path) -> None:
         [[x, y] for k, x in enumerate(np.arange(0.0, 300.0, 15.0)) for y in ((0, 90) if k % 2 else (90, 0))]
     )
     with pytest.raises(UsageError, match=r"fits nowhere between the buildings of .*village\.osm"):
-        simulate("residential", osm=extract, way_points=WayPoints(comb, is_placed=False))
+        simulate("residential", osm=extract, way_points=WayPoints(comb, has_place=False))
 
 
 def test_a_flight_crosses_any_ground_but_no_house(extract: Path) -> None:
@@ -204,7 +204,7 @@ def test_a_flight_crosses_any_ground_but_no_house(extract: Path) -> None:
 
 
 def test_the_whole_map_is_drawn_with_or_without_streets(extract: Path, tmp_path: Path) -> None:
-    scenario = scenario_named("residential")
+    scenario = find_scenario("residential")
     city, line = whole_map(scenario, 0, read_extract(extract))
     assert len(city.buildings) == len(houses())
     assert len(line) > 100

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from lslam.core.geometry import se3, so3
-from lslam.simulation.curve import RouteCurve, rounded_rectangle, smooth_curve, winding_line
-from lslam.simulation.path import SpeedProfile, Suspension, VehiclePath, drive, suspension
-from lslam.simulation.terrain import flat, rolling
+from lslam.simulation.curve import RouteCurve, flat, rolling, rounded_rectangle, smooth_curve, winding_line
+from lslam.simulation.path import SpeedProfile, Swing, VehiclePath, drive, suspension
 
-STILL = Suspension(np.zeros((1, 3)), np.zeros((1, 3)), np.ones(1))
+STILL = Swing(np.zeros((1, 3)), np.ones((1, 1)), np.zeros((1, 3)))
 
 
 def straight(length: float = 200.0) -> RouteCurve:
@@ -71,16 +70,16 @@ def test_no_acceleration_steps_and_the_jerk_is_limited(start: float) -> None:
     limits = SpeedProfile(12.0, start)
     path = drive(line, flat(), limits, line.length, 1.73, STILL)
     t = np.arange(0.0, path.duration, 0.02)
-    v, a, jerk = (np.asarray(path.travelled(t, nu=k)) for k in (1, 2, 3))
+    v, a, jerk = (np.asarray(path.distance(t, nu=k)) for k in (1, 2, 3))
     assert np.abs(jerk).max() < 1.2 * limits.jerk
     assert a.max() < limits.acceleration + 0.01
     assert a.min() > -limits.braking - 0.01
     assert a.min() < -1.0, "it does brake"
     assert v[0] == pytest.approx(start, abs=0.02)
     # Nor is any bend taken faster than it was to be.
-    across = v**2 * np.abs(line.curvature(np.asarray(path.travelled(t))))
+    across = v**2 * np.abs(line.curvature(np.asarray(path.distance(t))))
     assert across.max() < 1.1 * limits.lateral
-    assert float(path.travelled(path.duration)) == pytest.approx(line.length, abs=0.05)
+    assert float(path.distance(path.duration)) == pytest.approx(line.length, abs=0.05)
 
 
 def test_constant_speed_is_exact() -> None:
@@ -103,7 +102,7 @@ def test_bends_limit_the_speed_and_braking_comes_before_them() -> None:
     assert np.linalg.norm(v, axis=1).max() == pytest.approx(15.0, rel=0.01)
 
 
-def hilly_path(shaking: Suspension) -> VehiclePath:
+def hilly_path(shaking: Swing) -> VehiclePath:
     rng = np.random.default_rng(1)
     return drive(circle(30.0), rolling(rng), SpeedProfile(8.0, 8.0), 150.0, 1.73, shaking)
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from lslam.core.errors import ConfigError, UsageError
-from lslam.simulation.flight import HOVER, VIOLENT
 from lslam.simulation.imu import GRAVITY, specific_force
 from lslam.simulation.kinematics import Kinematics
+from lslam.simulation.path import HOVER, VIOLENT
 from lslam.simulation.routes import WayPoints
-from lslam.simulation.scenario_files import scenario_named
+from lslam.simulation.scenario_files import find_scenario
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 
 SEEDS = (0, 2)
@@ -77,6 +77,6 @@ def test_it_has_a_line_and_a_place_of_its_own() -> None:
     with pytest.raises(UsageError, match="leave out --path"):
         simulate("quadrotor", way_points=line)
     with pytest.raises(ConfigError, match="expected 'eights' there"):
-        scenario_named("quadrotor", ["path.shape=straight"])
+        find_scenario("quadrotor", ["path.shape=straight"])
     with pytest.raises(ConfigError, match="expected 'hall' there"):
-        scenario_named("street", ["path.shape=eights"])
+        find_scenario("street", ["path.shape=eights"])

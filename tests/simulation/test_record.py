@@ -12,7 +12,7 @@ import pytest
 from lslam.core.errors import OutputError, OutputExistsError
 from lslam.core.geometry import se3
 from lslam.core.types.scan import Scan
-from lslam.io.formats.calibration_files import read_odometry_calib
+from lslam.io.formats.kitti_layout import read_odometry_calib
 from lslam.io.formats.sequence_toml import read_sequence_toml
 from lslam.io.formats.trajectory_files import read_trajectory
 from lslam.simulation.record import record

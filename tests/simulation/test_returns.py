@@ -11,8 +11,8 @@ from scipy import stats
 
 from lslam.simulation.lidar import trace
 from lslam.simulation.lidar_models import LidarModel
-from lslam.simulation.returns import Hits, Rays, Returns, errors, mixed, range_walk, texture
-from lslam.simulation.scenario_files import scenario_named
+from lslam.simulation.returns import Hits, Rays, Returns, errors, mixed_pixels, range_walk, texture
+from lslam.simulation.scenario_files import find_scenario
 from lslam.simulation.scenarios import simulate
 from lslam.simulation.scene_mesh import MeshBuilder, RayScene, Surface
 
@@ -61,7 +61,7 @@ def test_all_off_is_byte_for_byte_what_it_was() -> None:
         assert asked.intensity is not None
         assert plain.intensity.tobytes() == asked.intensity.tobytes()
     assert not Returns().is_on
-    assert scenario_named("urban").real_returns is None
+    assert find_scenario("urban").real_returns is None
 
 
 def test_incidence_bias_is_nothing_at_normal_incidence_and_its_value_at_60_deg() -> None:
@@ -115,7 +115,7 @@ def test_mixed_pixels_lie_between_two_surfaces_and_only_at_their_edge() -> None:
     returns = Returns(divergence_mrad=2.0, pulse=0.75)
     flat = np.zeros(model.rays, np.float32)
     drawn = [
-        mixed(returns, model, step(0.6, model), flat, np.random.default_rng(k)).reshape(model.columns, -1)
+        mixed_pixels(returns, model, step(0.6, model), flat, np.random.default_rng(k)).reshape(model.columns, -1)
         for k in range(40)
     ]
     off = np.concatenate(drawn, axis=1)
@@ -135,14 +135,14 @@ def test_mixed_pixels_lie_between_two_surfaces_and_only_at_their_edge() -> None:
 def test_two_echoes_farther_apart_than_the_pulse_do_not_merge_nor_does_a_slope() -> None:
     model = replace(BEAMS, elevations_deg=tuple(np.linspace(10, -10, 64)), columns=2000)
     returns, flat = Returns(divergence_mrad=2.0, pulse=0.75), np.zeros(model.rays, np.float32)
-    assert not mixed(returns, model, step(0.8, model), flat, np.random.default_rng(0)).any()
+    assert not mixed_pixels(returns, model, step(0.8, model), flat, np.random.default_rng(0)).any()
     sky = step(0.0, model)
     sky[: model.rays // 2] = np.inf
-    assert not mixed(returns, model, sky, flat, np.random.default_rng(0)).any()
+    assert not mixed_pixels(returns, model, sky, flat, np.random.default_rng(0)).any()
     angle = np.linspace(0.9, 1.4, model.columns)
     grazing = np.repeat(5.0 / np.cos(angle), 64).astype(np.float32)
     slant = np.repeat(np.tan(angle), 64).astype(np.float32)
-    inner = mixed(returns, model, grazing, slant, np.random.default_rng(0)).reshape(model.columns, -1)[1:-1]
+    inner = mixed_pixels(returns, model, grazing, slant, np.random.default_rng(0)).reshape(model.columns, -1)[1:-1]
     assert not inner.any()
 
 

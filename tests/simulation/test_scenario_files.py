@@ -7,7 +7,7 @@ import pytest
 
 from lslam.core.errors import ConfigError, UsageError
 from lslam.simulation.built_scenario import BuiltScenario, build_scenario
-from lslam.simulation.scenario_files import Scenario, parse_scenario, scenario_named, scenario_names
+from lslam.simulation.scenario_files import Scenario, find_scenario, parse_scenario, scenario_names
 from lslam.simulation.scenarios import simulate
 
 SHARES_TOWNS = True
@@ -25,7 +25,7 @@ FLIGHTS = {
 def built(name: str, *settings: str) -> tuple[Scenario, BuiltScenario]:
     """A place without its houses, which take time and are not asked about here."""
     bare = ("world.levels=0", "layout.garden_trees=0", "layout.parked=0", "layout.trees=0", *settings)
-    scenario = scenario_named(name, bare)
+    scenario = find_scenario(name, bare)
     return scenario, build_scenario(scenario, 0)
 
 
@@ -88,7 +88,7 @@ def test_every_scenario_says_what_it_is() -> None:
     drives = {"block", "street", "residential", "urban", "motorway", "corridor", "identical", "walk", "carpark"}
     assert {*FLIGHTS, *drives, "quadrotor", "stairs"} <= set(names)
     for name in names:
-        scenario = scenario_named(name)
+        scenario = find_scenario(name)
         assert scenario.name == name
         assert scenario.summary.endswith(".")
         flown = scenario.carrier == "drone" and scenario.world.kind == "town"
@@ -97,8 +97,8 @@ def test_every_scenario_says_what_it_is() -> None:
 
 def test_settings_change_one_thing() -> None:
     plain, changed = (
-        scenario_named("urban"),
-        scenario_named("urban", ["layout.parked=0.9", "lidar=vlp16", "layout.storeys=[1, 2]"]),
+        find_scenario("urban"),
+        find_scenario("urban", ["layout.parked=0.9", "lidar=vlp16", "layout.storeys=[1, 2]"]),
     )
     assert (changed.layout.parked, changed.lidar, changed.layout.storeys) == (0.9, "vlp16", (1, 2))
     assert changed.model_dump(exclude={"layout", "lidar"}) == plain.model_dump(exclude={"layout", "lidar"})
@@ -128,7 +128,7 @@ def test_settings_change_one_thing() -> None:
 )
 def test_wrong_settings_are_named(setting: str, sentence: str) -> None:
     with pytest.raises(ConfigError) as said:
-        scenario_named("urban", [setting])
+        find_scenario("urban", [setting])
     assert sentence in str(said.value)
     assert "\n" not in str(said.value)
 
@@ -139,7 +139,7 @@ def test_unknown_keys_of_a_file_are_errors() -> None:
     with pytest.raises(ConfigError, match="summary: Field required"):
         parse_scenario("own", {"speed": 5.0, "start_speed": 5.0})
     with pytest.raises(UsageError, match="did you mean 'small-eight'"):
-        scenario_named("smal-eight")
+        find_scenario("smal-eight")
 
 
 def test_impossible_bends_and_speeds_are_refused() -> None:

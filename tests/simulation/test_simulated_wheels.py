@@ -13,7 +13,7 @@ from lslam.io.readers import open_sequence
 from lslam.io.readers.wheels import read_wheels
 from lslam.simulation.record import record
 from lslam.simulation.scenarios import SimulatedDrive, simulate
-from lslam.simulation.wheels import T_CAR_BASE, WheelModel
+from lslam.simulation.sensors import T_CAR_BASE, WheelModel
 
 SHARES_TOWNS = True
 PERFECT = WheelModel(100.0, 0, 0, 0, 0, 0, 0, 0, 0)

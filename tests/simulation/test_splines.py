@@ -7,7 +7,7 @@ import pytest
 from scipy.interpolate import make_interp_spline
 from scipy.ndimage import gaussian_filter1d
 
-from lslam.simulation.curve import interpolating_spline, smoothed
+from lslam.simulation.curve import gaussian_smooth, interpolating_spline
 
 
 @pytest.mark.parametrize("closed", [False, True])
@@ -32,4 +32,4 @@ def test_quintic_splines(closed: bool, count: int) -> None:
 def test_smoothing(mode: str) -> None:
     values = np.random.default_rng(1).normal(size=(200, 2))
     theirs = gaussian_filter1d(values, 3.3, axis=0, mode=mode)
-    np.testing.assert_allclose(smoothed(values, 3.3, mode), theirs, rtol=0, atol=1e-14)  # type: ignore[arg-type]
+    np.testing.assert_allclose(gaussian_smooth(values, 3.3, mode), theirs, rtol=0, atol=1e-14)  # type: ignore[arg-type]

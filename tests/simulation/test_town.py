@@ -12,10 +12,10 @@ from lslam.core.errors import UsageError
 from lslam.core.types.scan import Scan
 from lslam.simulation.built_scenario import check_bends, check_path
 from lslam.simulation.city import KERB, City
+from lslam.simulation.curve import Terrain
 from lslam.simulation.scenario_files import scenario_names
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 from lslam.simulation.scene_mesh import MeshBuilder, RayScene, Surface
-from lslam.simulation.terrain import Terrain
 from lslam.simulation.town import Network
 
 GROUND = (Surface.ROAD, Surface.PAVEMENT, Surface.LAWN)

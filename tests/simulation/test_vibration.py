@@ -10,7 +10,7 @@ from lslam.core.geometry import se3
 from lslam.simulation.kinematics import Vibration, shaking
 from lslam.simulation.lidar import trace
 from lslam.simulation.lidar_models import LidarModel
-from lslam.simulation.scenario_files import scenario_named
+from lslam.simulation.scenario_files import find_scenario
 from lslam.simulation.scenarios import simulate
 from lslam.simulation.scene_mesh import MeshBuilder, RayScene, Surface
 
@@ -40,7 +40,7 @@ def test_rays_feel_it() -> None:
     model = LidarModel("perfect", (10.0, -5.0, -30.0), 360, 0.1, 500.0, 0.0, 1e-6, 0.0, 1e6, 0.0)
     found = shaking(Vibration(angle_deg=1.0, height_mm=40.0), np.random.default_rng(2))
     assert found is not None
-    poses = found.shaken(np.eye(4), np.arange(360) * 0.1 / 360)
+    poses = found.shake(np.eye(4), np.arange(360) * 0.1 / 360)
     scan = trace(RayScene(builder.build()), model, poses, np.random.default_rng(0), compensated=True)
     assert scan.times is None
     column = np.tile(np.arange(360), 3)
@@ -69,4 +69,4 @@ def test_the_truth_and_the_imu_do_not(compensated: bool) -> None:
 
 def test_a_band_out_of_order_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"vibration\.band_hz"):
-        scenario_named("urban", ["vibration.band_hz=[20, 5]"])
+        find_scenario("urban", ["vibration.band_hz=[20, 5]"])

@@ -12,7 +12,7 @@ from lslam.core.errors import InputError
 from lslam.core.geometry import se3, so3
 from lslam.core.geometry.geodesy import from_local
 from lslam.core.types.trajectory import Trajectory
-from lslam.io.formats.trajectory_files import write_kitti, write_tum
+from lslam.io.formats.trajectory_lines import write_kitti, write_tum
 from lslam.simulation.routes import read_way_points
 from lslam.simulation.scenarios import simulate
 

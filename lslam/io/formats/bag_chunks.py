@@ -85,8 +85,8 @@ class RangedFile:
             runs = np.split(wanted, np.flatnonzero(np.diff(wanted) > 1) + 1)
             while len(self._blocks) > max(_KEPT - len(wanted), 0):
                 self._blocks.popitem(last=False)
-            found = self.path.read_ranges([(int(r[0]) * BLOCK, min(int(r[-1] + 1) * BLOCK, self.size)) for r in runs])
-            for run, data in zip(runs, found, strict=True):
+            parts = self.path.read_ranges([(int(r[0]) * BLOCK, min(int(r[-1] + 1) * BLOCK, self.size)) for r in runs])
+            for run, data in zip(runs, parts, strict=True):
                 for n, k in enumerate(run.tolist()):
                     self._blocks[k] = data[n * BLOCK : (n + 1) * BLOCK]
         self._blocks.move_to_end(number)
@@ -134,12 +134,12 @@ class Topic:
 class ChunkFile:
     """Random access to a file and to its chunks, from any thread; the last decompressed chunk is cached."""
 
-    def __init__(self, path: Path, unpacked: Path | None = None) -> None:
-        """Open `path`, or its decompressed copy `unpacked` if there is one."""
+    def __init__(self, path: Path, copy: Path | None = None) -> None:
+        """Open `path`, or its decompressed copy `copy` if there is one."""
         self.path = path
         with input_errors(path):
             self._ranged = RangedFile(path) if isinstance(path, RemotePath) else None
-            self._file = None if self._ranged else (unpacked or path).open("rb")
+            self._file = None if self._ranged else (copy or path).open("rb")
         self.size = os.fstat(self._file.fileno()).st_size if self._file else self._ranged.size if self._ranged else 0
         self._kept: tuple[int, bytes] = (-1, b"")
 

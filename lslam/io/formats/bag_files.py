@@ -28,8 +28,7 @@ from lslam.core.types.arrays import Longs
 from lslam.io.formats.bag_chunks import LARGEST, Topic, damage, unpack, zstd
 from lslam.io.formats.bag_listing import SUFFIXES, left_out, list_bag_files, missing_parts, packing_of, suffix_of
 from lslam.io.formats.bag_records import ChunkedBag
-from lslam.io.formats.bag_sqlite import SqliteBag
-from lslam.io.formats.chunked_bags import McapFile, Ros1Bag
+from lslam.io.formats.chunked_bags import McapFile, Ros1Bag, SqliteBag
 from lslam.io.remote import RemotePath
 
 T = TypeVar("T")
@@ -187,7 +186,7 @@ def _recordings(files: list[Path], notes: list[str], losses: list[str]) -> list[
     failures: list[InputError] = []
     for file in files:
         try:
-            with unpacked(file) as (there, loss):
+            with unpack_file(file) as (there, loss):
                 recordings.append(_reader(file, there)(file, there))
             losses += [loss] if loss else []
             packed += [file.name] if there != file else []
@@ -227,9 +226,9 @@ def _is_within(topics: list[Topic], others: list[Topic]) -> bool:
     The comparison stops early if its time range is not within theirs.
     """
 
-    def has_all(stamps: Longs, wanted: Longs) -> bool:
-        is_around = len(stamps) > 0 and stamps[0] <= wanted[0] and wanted[-1] <= stamps[-1]
-        return is_around and bool(np.isin(wanted, stamps).all())
+    def has_all(stamps: Longs, others_ns: Longs) -> bool:
+        is_around = len(stamps) > 0 and stamps[0] <= others_ns[0] and others_ns[-1] <= stamps[-1]
+        return is_around and bool(np.isin(others_ns, stamps).all())
 
     return all(any(o.name == t.name and has_all(o.stamps_ns, t.stamps_ns) for o in others) for t in topics if len(t))
 
@@ -304,7 +303,7 @@ def _decompress(recording: Recording, topic: Topic, k: int, limit: int | None) -
 
 
 @contextmanager
-def unpacked(path: Path) -> Iterator[tuple[Path, str]]:
+def unpack_file(path: Path) -> Iterator[tuple[Path, str]]:
     """Decompress a file that is compressed as a whole: path of the copy, and a sentence about missing data.
 
     A file that is not compressed gives `path` itself. The copy is deleted after the `with`. Handles that were opened within

@@ -55,10 +55,10 @@ class ChunkedBag(ABC):
     NAMES: ClassVar[tuple[int, ...]]
     FOOTER: ClassVar[int] = 0
 
-    def __init__(self, path: Path, unpacked: Path | None = None) -> None:
+    def __init__(self, path: Path, copy: Path | None = None) -> None:
         """Open `path`, or its decompressed copy if there is one. Raises InputError for another format."""
         self.path, self.loss = path, ""
-        self._file = ChunkFile(path, unpacked)
+        self._file = ChunkFile(path, copy)
         self._chunks: list[Chunk] = []
         self._pieces: dict[int, list[Rows]] = defaultdict(list)  # by channel: stamps, chunk numbers, offsets
         head = self._file.part(None, 0, len(self.MAGIC))
@@ -204,9 +204,9 @@ class ChunkedBag(ABC):
         self._chunks.append(chunk)
         return len(self._chunks) - 1
 
-    def _add(self, chunk: int, found: Mapping[int, Any]) -> None:
+    def _add(self, chunk: int, messages: Mapping[int, Any]) -> None:
         """Add the messages of a chunk: stamps and offsets, (N, 2), by channel."""
-        for channel, rows in found.items():
+        for channel, rows in messages.items():
             if len(rows):
                 table = np.full((len(rows), 3), chunk, np.int64)
                 table[:, ::2] = np.asarray(rows, np.uint64)
@@ -216,15 +216,15 @@ class ChunkedBag(ABC):
         """Collect the messages of a chunk without an index by reading it. Returns the end of the last record."""
         if number is None:
             return 0
-        found: dict[int, list[tuple[int, int]]] = defaultdict(list)
+        messages: dict[int, list[tuple[int, int]]] = defaultdict(list)
 
         def note(record: Record, offset: int) -> None:
             if record.op == self.MESSAGE and record.size >= 0:
                 channel, stamp = self._message(record)
-                found[channel].append((stamp, offset))
+                messages[channel].append((stamp, offset))
 
         end = self._each_record(self._chunks[number], note)
-        self._add(number, found)
+        self._add(number, messages)
         return end
 
     def _find_missing_names(self) -> None:

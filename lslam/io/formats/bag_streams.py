@@ -132,17 +132,17 @@ def is_static(topic: BagTopic) -> bool:
 
 def read_transforms(bag: Bag, topic: BagTopic, problems: list[str], most: int | None = None) -> Transforms:
     """`T_parent_child` (N, 4, 4) by (parent, child), from all or the first few messages of a TFMessage topic."""
-    found: dict[tuple[str, str], list[list[float]]] = {}
+    rows_of: dict[tuple[str, str], list[list[float]]] = {}
 
     def note(data: bytes) -> None:
         for t in bag.decode(topic, data).transforms:
             pair = (t.header.frame_id.lstrip("/"), t.child_frame_id.lstrip("/"))
             row = _numbers(topic, t.transform.translation, t.transform.rotation)
-            found.setdefault(pair, []).append(row)
+            rows_of.setdefault(pair, []).append(row)
 
     for _ in islice(bag.each(topic, note, problems), most):
         pass
-    return {pair: _poses(np.array(rows, np.float64)) for pair, rows in found.items()}
+    return {pair: _poses(np.array(rows, np.float64)) for pair, rows in rows_of.items()}
 
 
 def read_text(bag: Bag, name: str) -> str | None:

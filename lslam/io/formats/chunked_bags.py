@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import sqlite3
 import struct
+import threading
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.errors import InputError, UsageError
 from lslam.io.formats.bag_chunks import Chunk, Topic
 from lslam.io.formats.bag_records import INDICES, ChunkedBag, Record
+from lslam.io.remote import RemotePath
 
 # Of MCAP.
 _SCHEMA, _CHANNEL = 3, 4
@@ -19,6 +24,7 @@ _PREFIX = 9  # bytes before the content of a record: op and length
 _STAMPS = 22  # bytes before the data of a message: channel, sequence, log time, publish time
 _CHUNK_HEAD = 64  # more than what stands before the records of a chunk
 _HEADER = 4096  # of ROS 1: more than any record header but one with a message definition
+_TABLES = {"topics", "messages"}
 
 
 class Ros1Bag(ChunkedBag):
@@ -27,10 +33,10 @@ class Ros1Bag(ChunkedBag):
     MAGIC = b"#ROSBAG V2.0\n"
     MESSAGE, INDEX, CHUNK, CHUNK_INFO, NAMES = 2, 4, 5, 6, (7,)
 
-    def __init__(self, path: Path, unpacked: Path | None = None) -> None:
+    def __init__(self, path: Path, copy: Path | None = None) -> None:
         """Open `path`, or what it holds, where it was unpacked."""
         self._connections: dict[int, Topic] = {}
-        super().__init__(path, unpacked)
+        super().__init__(path, copy)
 
     def _misnomer(self, head: bytes) -> str:
         is_old = head.startswith(b"#ROSBAG")
@@ -98,11 +104,11 @@ class McapFile(ChunkedBag):
     MAGIC = b"\x89MCAP0\r\n"
     MESSAGE, INDEX, CHUNK, CHUNK_INFO, NAMES, FOOTER = 5, 7, 6, 8, (_SCHEMA, _CHANNEL), 2
 
-    def __init__(self, path: Path, unpacked: Path | None = None) -> None:
+    def __init__(self, path: Path, copy: Path | None = None) -> None:
         """Open `path`, or what it holds, where it was unpacked."""
         self._schemas: dict[int, str] = {}
         self._channels: dict[int, tuple[int, str, str]] = {}
-        super().__init__(path, unpacked)
+        super().__init__(path, copy)
 
     def _misnomer(self, head: bytes) -> str:
         return "no MCAP file"
@@ -161,3 +167,84 @@ def _text(data: bytes, at: int) -> tuple[str, int]:
     (length,) = struct.unpack_from("<I", data, at)
     end = at + 4 + length
     return data[at + 4 : end].decode(errors="replace"), end
+
+
+class SqliteBag:
+    """One `.db3` file: `topics`, and `loss`, a sentence when it was cut off."""
+
+    def __init__(self, path: Path, copy: Path | None = None) -> None:
+        """Open `path`, or its decompressed copy if there is one."""
+        if isinstance(path, RemotePath):
+            raise UsageError(
+                f"{path}: SQLite cannot be read in place from storage; *.mcap and *.bag are: `lslam convert` makes an MCAP file "
+                "of a copy, or run the copy"
+            )
+        self.path, self._on_disk = path, copy or path
+        self.loss = ""
+        self._lock = threading.Lock()
+        try:
+            # Nothing is written beside the file, neither a lock nor a journal.
+            self._db = sqlite3.connect(
+                f"file:{quote(str(self._on_disk.resolve()))}?immutable=1", uri=True, check_same_thread=False
+            )
+            # SQLite then opens files that are shorter than their header says; nothing can be changed all the same.
+            self._db.execute("PRAGMA writable_schema = ON")
+            names = {str(name) for (name,) in self._db.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+            if not names >= _TABLES:
+                raise InputError(f"{path} is no ROS 2 bag: its tables are {', '.join(sorted(names)) or 'none'}")
+            rows = self._db.execute("SELECT id, name, type, serialization_format FROM topics ORDER BY id").fetchall()
+        except sqlite3.Error as error:
+            raise InputError(f"{path} cannot be read as a ROS 2 bag in SQLite: {error}") from None
+        self._topics = {
+            number: Topic(_word(name), _word(kind), _word(encoding)) for number, name, kind, encoding in rows
+        }
+        self._index()
+        self.topics = list(self._topics.values())
+        if path.with_name(path.name + "-wal").is_file():
+            self.loss = self.loss or f"{path}-wal holds messages that were never merged: `ros2 bag reindex` does that"
+
+    def expect(self, topic: Topic, is_head: bool) -> None:
+        """Do nothing: a file on a disk needs no prefetching."""
+
+    def read(self, topic: Topic, k: int, limit: int | None = None) -> bytes:
+        """Bytes of message `k` of `topic`; with `limit`, at least its first `limit` bytes."""
+        row = int(topic.where[k, 0])
+        try:
+            with self._lock, self._db.blobopen("messages", "data", row, readonly=True) as blob:
+                return blob.read(-1 if limit is None else limit)
+        except sqlite3.Error as error:
+            raise InputError(f"{self.path}: message {k} of {topic.name} is damaged: {error}") from None
+
+    def _index(self) -> None:
+        """Read stamps and row numbers of all messages; the data itself stays on disk."""
+        entries_of: dict[int, list[tuple[int, int]]] = {number: [] for number in self._topics}
+        try:
+            for row, topic, stamp in self._db.execute("SELECT id, topic_id, timestamp FROM messages ORDER BY id"):
+                if topic in entries_of and isinstance(stamp, int) and isinstance(row, int):
+                    entries_of[topic].append((stamp, row))
+        except sqlite3.Error as error:
+            self.loss = (
+                f"{self.path} is damaged ({error}): {sum(map(len, entries_of.values()))} messages up to there are read"
+            )
+        size, stated = self._sizes()
+        if size < stated:
+            self.loss = (
+                f"{self.path} is cut off: it has {size} of {stated} bytes, {(stated - size) / stated:.1%} are lost; "
+                f"{sum(map(len, entries_of.values()))} messages are listed, those that reach beyond the cut cannot be read"
+            )
+        for number, entries in entries_of.items():
+            table = np.array(sorted(entries), np.int64).reshape(-1, 2)
+            self._topics[number].stamps_ns = table[:, 0].copy()
+            self._topics[number].where = np.column_stack([table[:, 1], np.zeros(len(table), np.int64)])
+
+    def _sizes(self) -> tuple[int, int]:
+        """Size of the file and the size that its header states, bytes (SQLite's file format, 1.3)."""
+        with self._on_disk.open("rb") as file:
+            header = file.read(100)
+        page, pages = int.from_bytes(header[16:18], "big"), int.from_bytes(header[28:32], "big")
+        return self._on_disk.stat().st_size, pages * (65536 if page == 1 else page)
+
+
+def _word(value: object) -> str:
+    """Text of a column; empty if it holds something else."""
+    return value if isinstance(value, str) else ""

@@ -41,14 +41,14 @@ def octree(axes: Sequence[NDArray[np.int32]], edge: int) -> tuple[Longs, NDArray
     while len(rest):
         size = edge / 2**level
         packed, first, node, sizes = np.unique(
-            _packed(axes, rest, size, 1 << level, 1 << level),
+            _box_numbers(axes, rest, size, 1 << level, 1 << level),
             return_index=True,
             return_inverse=True,
             return_counts=True,
         )
         is_kept = sizes[node] <= _MOST
         if size > _CELLS and level < _DEEPEST:
-            cells = _packed(axes, rest, size / _CELLS, _CELLS << level, _CELLS)
+            cells = _box_numbers(axes, rest, size / _CELLS, _CELLS << level, _CELLS)
             is_kept[np.unique(node * _CELLS**3 + cells, return_index=True)[1]] = True
         else:
             is_kept[:] = True
@@ -64,7 +64,9 @@ def _boxes(steps: NDArray[np.int32], size: float, most: int) -> Longs:
     return np.minimum((steps / size).astype(np.int64), most - 1)
 
 
-def _packed(axes: Sequence[NDArray[np.int32]], some: NDArray[np.int32], size: float, most: int, side: int) -> Longs:
+def _box_numbers(
+    axes: Sequence[NDArray[np.int32]], some: NDArray[np.int32], size: float, most: int, side: int
+) -> Longs:
     """(M,) number of the box of each of the points `some`, in the cube of `side` boxes along each axis that it belongs to."""
     packed = np.zeros(len(some), np.int64)
     for axis in axes:

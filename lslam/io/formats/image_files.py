@@ -1,4 +1,4 @@
-"""Images as arrays: PNG, JPEG and what else Pillow decodes, and encodings of ROS. The only file that knows Pillow."""
+"""Images as arrays: PNG, JPEG and what else Pillow decodes, encodings of ROS, and GeoTIFF. The only file that knows Pillow."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from lslam.core.errors import InputError, input_errors
 from lslam.core.extras import importing
+from lslam.core.types.arrays import Floats
 from lslam.core.types.camera import Image
 from lslam.io.formats.atomic import atomic_write
 
@@ -23,23 +24,27 @@ _PACKED = {"rgb8": (3, (0, 1, 2)), "bgr8": (3, (2, 1, 0)), "rgba8": (4, (0, 1, 2
 _PACKED |= {"8UC3": (3, (2, 1, 0)), "8UC4": (4, (2, 1, 0)), "mono8": (1, (0, 0, 0)), "8UC1": (1, (0, 0, 0))}
 # Where red is in a cell of two by two pixels; blue is across from it.
 _BAYER = {"bayer_rggb8": (0, 0), "bayer_bggr8": (1, 1), "bayer_gbrg8": (1, 0), "bayer_grbg8": (0, 1)}
+# Tags of TIFF and keys of GeoTIFF (OGC 19-008r4), and GDAL's own tag for pixels without a value.
+_TRANSFORMATION, _KEYS, _NODATA = 34264, 34735, 42113
+_MODEL, _RASTER, _CRS = 1024, 1025, 3072
+_SHORT, _DOUBLE = 3, 12
 
 
 def read_image(path: Path) -> Image:
     """Pixels (height, width, 3) of an image file, red, green, blue. Raises InputError naming it."""
     with input_errors(path), path.open("rb") as stream:
-        return _decoded(stream, str(path))
+        return _decode(stream, str(path))
 
 
 def image_size(path: Path) -> tuple[int, int]:
     """Width and height of an image file, by its header. Raises InputError naming it."""
-    with input_errors(path), path.open("rb") as stream, _opened(stream, str(path)) as image:
+    with input_errors(path), path.open("rb") as stream, _open_image(stream, str(path)) as image:
         return int(image.width), int(image.height)
 
 
 def decode_image(data: bytes, source: str) -> Image:
     """As `read_image`, from bytes; errors name `source`."""
-    return _decoded(io.BytesIO(data), source)
+    return _decode(io.BytesIO(data), source)
 
 
 def write_png(path: Path, image: Image) -> None:
@@ -78,8 +83,8 @@ def _of_cells(raw: NDArray[np.uint8], row: int, column: int) -> Image:
     return np.pad(out, ((0, raw.shape[0] % 2), (0, raw.shape[1] % 2), (0, 0)), mode="edge")
 
 
-def _decoded(stream: BinaryIO, source: str) -> Image:
-    with _opened(stream, source) as image:
+def _decode(stream: BinaryIO, source: str) -> Image:
+    with _open_image(stream, source) as image:
         if image.width * image.height > _MOST:
             raise InputError(f"{source}: {image.width} x {image.height} pixels are too many for an image of a camera")
         try:
@@ -90,7 +95,7 @@ def _decoded(stream: BinaryIO, source: str) -> Image:
             raise InputError(f"{source} cannot be read as an image: {error}") from None
 
 
-def _opened(stream: BinaryIO, source: str) -> Any:
+def _open_image(stream: BinaryIO, source: str) -> Any:
     with importing("Pillow", _WAY_OUT):
         import PIL
         from PIL import Image as Pillow
@@ -99,3 +104,23 @@ def _opened(stream: BinaryIO, source: str) -> Any:
     except (OSError, ValueError, SyntaxError, EOFError, Pillow.DecompressionBombError) as error:
         what = "no image" if isinstance(error, PIL.UnidentifiedImageError) else str(error)
         raise InputError(f"{source} cannot be read as an image: {what}") from None
+
+
+def write_geotiff(path: Path, image: NDArray[np.uint8], transform: Floats, epsg: int | None, nodata: int) -> None:
+    """Write a grey image (H, W) with a place in coordinates of GIS as deflated GeoTIFF 1.1, atomically. Raises OutputError.
+
+    transform : (2, 3) from column and row, whose whole numbers are corners of pixels, to easting and northing, m
+    epsg : code of the coordinate reference system, None for local coordinates; nodata : value of pixels without one
+    """
+    with importing("Pillow", _WAY_OUT):
+        from PIL import Image as Pillow
+        from PIL.TiffImagePlugin import ImageFileDirectory_v2
+    (a, b, x), (c, d, y) = np.asarray(transform, np.float64).tolist()
+    keys = [(_MODEL, 1 if epsg else 32767), (_RASTER, 1), *([(_CRS, epsg)] if epsg else [])]
+    tags: Any = ImageFileDirectory_v2()
+    tags.tagtype[_TRANSFORMATION], tags.tagtype[_KEYS] = _DOUBLE, _SHORT
+    tags[_TRANSFORMATION] = (a, b, 0.0, x, c, d, 0.0, y, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+    tags[_KEYS] = (1, 1, 1, len(keys), *(number for key, value in keys for number in (key, 0, 1, value)))
+    tags[_NODATA] = str(nodata)
+    with atomic_write(path) as stream:
+        Pillow.fromarray(image).save(stream, format="TIFF", tiffinfo=tags, compression="tiff_adobe_deflate")

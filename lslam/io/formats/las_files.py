@@ -23,11 +23,10 @@ from lslam.core import __version__
 from lslam.core.errors import InputError, OutputError, cause
 from lslam.core.extras import importing
 from lslam.core.labels import asprs_table
-from lslam.core.types.arrays import Floats
+from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.cloud import BLOCK, TIME_NS, ArrayCloud, Cloud, CloudBlock, Columns, in_memory
 from lslam.io.formats.atomic import atomic_write
 from lslam.io.formats.copc_files import INFO, INFO_BYTES, USER_ID, copc_bytes, is_copc
-from lslam.io.formats.gps_time import gps_time_s, unix_time_ns
 from lslam.io.formats.text_tables import is_unix_time
 
 if TYPE_CHECKING:
@@ -54,6 +53,19 @@ _ABOUT = {  # 32 characters at most
     "class": "class of the recording",
 }
 _BLOCK = 1 << 26  # bytes of points decompressed at a time
+_GPS_EPOCH_S = 315_964_800  # Unix time of 1980-01-06
+_LAS_OFFSET_S = 1_000_000_000
+# s that GPS is ahead of UTC, from the Unix time on at which it grew (IERS, Bulletin C); before 1999 nothing counts as Unix time.
+_LEAPS = np.array(
+    [
+        (915_148_800, 13),
+        (1_136_073_600, 14),
+        (1_230_768_000, 15),
+        (1_341_100_800, 16),
+        (1_435_708_800, 17),
+        (1_483_228_800, 18),
+    ]
+)
 
 
 def check_las(stream: BinaryIO) -> tuple[int, int]:
@@ -200,7 +212,7 @@ def write_las(path: Path, cloud: Cloud, wkt: str = "") -> None:
 
 def read_las(path: Path) -> tuple[ArrayCloud, str]:
     """Read points (m), 16-bit intensities and WKT (empty if none) of a LAS or LAZ file. Raises InputError if it is damaged."""
-    with _opened(path) as (reader, size):
+    with _open_reader(path) as (reader, size):
         blocks = [
             (np.column_stack([block.x, block.y, block.z]), np.asarray(block.intensity, np.float32))
             for block in reader.chunk_iterator(size)
@@ -227,7 +239,7 @@ class LasCloud:
 
     def blocks(self) -> Iterator[CloudBlock]:
         """The points, in the coordinates of the file. Raises InputError if it is damaged."""
-        with _opened(self.path) as (reader, size):
+        with _open_reader(self.path) as (reader, size):
             for block in reader.chunk_iterator(min(size, BLOCK)):
                 columns = {name: self._column(block, name, kind) for name, kind in self.column_types.items()}
                 points = np.column_stack([block.x, block.y, block.z])
@@ -244,7 +256,7 @@ class LasCloud:
 
 def open_las(path: Path, attributes: Collection[str]) -> LasCloud:
     """Open a map of lslam whose points have these `attributes`, as its note names them. Raises InputError if it is damaged."""
-    with _opened(path) as (reader, _):
+    with _open_reader(path) as (reader, _):
         header = reader.header
     kinds = {d.name: d.dtype for d in header.point_format.dimensions if d.dtype is not None}
     types: dict[str, np.dtype[Any]] = {name: np.dtype(np.uint8) for name in _COLOURS if name in kinds}
@@ -255,7 +267,7 @@ def open_las(path: Path, attributes: Collection[str]) -> LasCloud:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[tuple[Any, int]]:
+def _open_reader(path: Path) -> Iterator[tuple[Any, int]]:
     """A reader of laspy, and how many points it may decompress at a time. Raises InputError for whatever goes wrong inside."""
     with importing("laspy", _WAY_OUT):
         import laspy
@@ -324,3 +336,28 @@ def _survey(cloud: Cloud) -> tuple[Floats, Floats, float, int]:
             largest = max(largest, float(block.intensity.max()))
         first_ns = min(first_ns, int(block.columns[TIME_NS].min()) if TIME_NS in block.columns else 0)
     return (low, high, largest, first_ns) if np.isfinite(low).all() else (np.zeros(3), np.zeros(3), 0.0, 0)
+
+
+def gps_time_s(stamps_ns: Longs, is_unix: bool) -> Floats:
+    """(N,) adjusted standard GPS time, s since 1980-01-06 less 1e9, of Unix times (N,), ns; of another clock its own seconds.
+
+    >>> gps_time_s(np.array([1_700_000_000_500_000_000]), True).tolist()
+    [384035218.5]
+    """
+    if not is_unix:
+        return np.asarray(1e-9 * stamps_ns)
+    seconds, rest_ns = np.divmod(stamps_ns, 10**9)
+    leaps = _LEAPS[np.maximum(np.searchsorted(_LEAPS[:, 0], seconds, side="right") - 1, 0), 1]
+    return np.asarray((seconds - _GPS_EPOCH_S + leaps - _LAS_OFFSET_S) + 1e-9 * rest_ns)
+
+
+def unix_time_ns(gps_s: Floats) -> Longs:
+    """(N,) Unix times, ns, of adjusted standard GPS times (N,), s: the inverse of `gps_time_s`, to the last bits of a double.
+
+    >>> unix_time_ns(np.array([384035218.5])).tolist()
+    [1700000000500000000]
+    """
+    seconds, rest = np.divmod(gps_s, 1.0)
+    ahead = seconds.astype(np.int64) + _GPS_EPOCH_S + _LAS_OFFSET_S
+    leaps = _LEAPS[np.maximum(np.searchsorted(_LEAPS.sum(axis=1), ahead, side="right") - 1, 0), 1]
+    return np.asarray((ahead - leaps) * 10**9 + np.rint(1e9 * rest).astype(np.int64))

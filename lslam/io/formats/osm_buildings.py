@@ -30,12 +30,12 @@ NodeIds = tuple[int, ...]
 class BuildingExtract:
     """The buildings of one extract, in the local frame at `origin`.
 
-    buildings : in the order of the file, ways first; skipped : why elements were left out -> how many
+    buildings : in the order of the file, ways first; omissions : why elements were left out -> how many
     origin : (3,) lat, lon (deg), height (m) of x = y = 0; attribution : as `OsmData.attribution`; source : for messages
     """
 
     buildings: list[Building]
-    skipped: Mapping[str, int]
+    omissions: Mapping[str, int]
     origin: Floats
     attribution: str | None
     source: str
@@ -55,7 +55,7 @@ def some_buildings_of(data: OsmData, origin: NDArray[Any], path: Path) -> Buildi
     """`buildings_of` the data read from `path`. Raises InputError naming the file if there are none."""
     extract = buildings_of(data, origin, str(path))
     if not extract.buildings:
-        why = ", ".join(f"{count} x {reason}" for reason, count in extract.skipped.items())
+        why = ", ".join(f"{count} x {reason}" for reason, count in extract.omissions.items())
         raise InputError(
             f"{path} holds no building outline ({len(data.ways)} ways, {len(data.relations)} relations"
             f"{'; left out: ' + why if why else ''}): fetch an extract with the buildings of the place"
@@ -73,28 +73,28 @@ def buildings_of(data: OsmData, origin: NDArray[Any], source: str = "the extract
     where = _Positions(data, at)
     if data.nodes and not (away := where.distance()) < FARTHEST_M:
         far = "more than a continent" if not np.isfinite(away) else distance_text(away)
-        raise InputError(f"{source} lies {far} away from the origin: {right_place(at, _is_swapped(data, at))}")
-    skipped: Counter[str] = Counter()
+        raise InputError(f"{source} lies {far} away from the origin: {right_place(at, _has_swapped_axes(data, at))}")
+    omissions: Counter[str] = Counter()
     of_relations: list[Building] = []
     outlines: set[int] = set()
     for relation in data.relations.values():
-        if relation.tags.get("type") != "multipolygon" or not _counts(relation.tags, skipped):
+        if relation.tags.get("type") != "multipolygon" or not _counts(relation.tags, omissions):
             continue
-        footprints = _relation_footprints(relation, data, where, skipped)
+        footprints = _relation_footprints(relation, data, where, omissions)
         if footprints:
             of_relations.append(_building(f"relation/{relation.id}", footprints, relation.tags))
             outlines |= {m.ref for m in relation.members if m.kind == "way" and m.role in ("", "outer")}
     buildings: list[Building] = []
     for way in data.ways.values():
-        if not _counts(way.tags, skipped):
+        if not _counts(way.tags, omissions):
             continue
         if way.id in outlines:
-            skipped["outline of a multipolygon already read"] += 1
+            omissions["outline of a multipolygon already read"] += 1
             continue
-        footprints = _way_footprints(way, where, skipped)
+        footprints = _way_footprints(way, where, omissions)
         if footprints:
             buildings.append(_building(f"way/{way.id}", footprints, way.tags))
-    return BuildingExtract(buildings + of_relations, dict(skipped), at, data.attribution, source)
+    return BuildingExtract(buildings + of_relations, dict(omissions), at, data.attribution, source)
 
 
 def middle_of(data: OsmData) -> Floats:
@@ -129,49 +129,49 @@ class _Positions:
         return np.asarray(self.xy[[self.row[node] for node in nodes[:-1]]])
 
 
-def _counts(tags: Mapping[str, str], skipped: Counter[str]) -> bool:
-    """Whether an element is a building above the ground. Other buildings are counted in `skipped`."""
+def _counts(tags: Mapping[str, str], omissions: Counter[str]) -> bool:
+    """Whether an element is a building above the ground. Other buildings are counted in `omissions`."""
     kind = tags.get("building")
     if kind is None:
         return False
     if kind.strip().lower() == "no":
-        skipped["building=no"] += 1
+        omissions["building=no"] += 1
     elif is_underground(tags):
-        skipped["underground"] += 1
+        omissions["underground"] += 1
     else:
         return True
     return False
 
 
-def _way_footprints(way: Way, where: _Positions, skipped: Counter[str]) -> tuple[Footprint, ...]:
+def _way_footprints(way: Way, where: _Positions, omissions: Counter[str]) -> tuple[Footprint, ...]:
     if not where.has(way.nodes) or not way.nodes:
-        skipped["nodes missing"] += 1
-    elif not way.is_closed:
-        skipped["open way"] += 1
-    elif found := footprints_from_rings([where.ring(way.nodes)], []):
-        return found
+        omissions["nodes missing"] += 1
+    elif not way.is_ring:
+        omissions["open way"] += 1
+    elif footprints := footprints_from_rings([where.ring(way.nodes)], []):
+        return footprints
     else:
-        skipped["no area"] += 1
+        omissions["no area"] += 1
     return ()
 
 
 def _relation_footprints(
-    relation: Relation, data: OsmData, where: _Positions, skipped: Counter[str]
+    relation: Relation, data: OsmData, where: _Positions, omissions: Counter[str]
 ) -> tuple[Footprint, ...]:
     members = [m for m in relation.members if m.kind == "way" and m.role in ("", "outer", "inner")]
     ways = [data.ways.get(m.ref) for m in members]
     if not all(way is not None and way.nodes and where.has(way.nodes) for way in ways):
-        skipped["nodes missing"] += 1
+        omissions["nodes missing"] += 1
         return ()
     parts = [(m.role == "inner", way.nodes) for m, way in zip(members, ways, strict=True) if way is not None]
     outer, inner = (join_rings([nodes for is_inner, nodes in parts if is_inner == wanted]) for wanted in (False, True))
     if not outer or inner is None:
-        skipped["rings that do not close"] += 1
+        omissions["rings that do not close"] += 1
         return ()
-    found = footprints_from_rings([where.ring(ring) for ring in outer], [where.ring(ring) for ring in inner])
-    if not found:
-        skipped["no area"] += 1
-    return found
+    footprints = footprints_from_rings([where.ring(ring) for ring in outer], [where.ring(ring) for ring in inner])
+    if not footprints:
+        omissions["no area"] += 1
+    return footprints
 
 
 def _building(osm_id: str, footprints: tuple[Footprint, ...], tags: Mapping[str, str]) -> Building:
@@ -179,14 +179,14 @@ def _building(osm_id: str, footprints: tuple[Footprint, ...], tags: Mapping[str,
     return Building(osm_id, footprints, height_of(tags), base_of(tags), own)
 
 
-def _is_swapped(data: OsmData, origin: Floats) -> bool:
+def _has_swapped_axes(data: OsmData, origin: Floats) -> bool:
     """Whether data and origin would agree if latitude and longitude were swapped."""
     return abs(float(origin[1])) <= 90 and _Positions(data, origin[[1, 0, 2]]).distance() < FARTHEST_M
 
 
-def right_place(origin: Floats, is_swapped: bool = False) -> str:
+def right_place(origin: Floats, has_swapped_axes: bool = False) -> str:
     """Advice for a message about an extract of another place."""
-    if is_swapped:
+    if has_swapped_axes:
         return (
             f"latitude and longitude are swapped, in --origin ({origin[0]:.5f},{origin[1]:.5f}; latitude first) or in the file "
             "(GeoJSON has the longitude first)"
@@ -226,17 +226,17 @@ def is_underground(tags: Mapping[str, str]) -> bool:
 
 
 def _number(text: str) -> float | None:
-    found = re.fullmatch(r"\s*([+-]?\d+(?:[.,]\d+)?)\s*", text)
-    return float(found[1].replace(",", ".")) if found else None
+    match = re.fullmatch(r"\s*([+-]?\d+(?:[.,]\d+)?)\s*", text)
+    return float(match[1].replace(",", ".")) if match else None
 
 
 def _length(text: str) -> float | None:
     """Metres from `12`, `12.5 m`, `40 ft` or `40'6"`."""
-    found = re.fullmatch(r"\s*(\d+(?:[.,]\d+)?)\s*(m|metres?|meters?|ft|feet|')?\s*(?:(\d+(?:\.\d+)?)\")?\s*", text)
-    if not found or (found[3] and found[2] != "'"):
+    match = re.fullmatch(r"\s*(\d+(?:[.,]\d+)?)\s*(m|metres?|meters?|ft|feet|')?\s*(?:(\d+(?:\.\d+)?)\")?\s*", text)
+    if not match or (match[3] and match[2] != "'"):
         return None
-    value = float(found[1].replace(",", "."))
-    return value * FOOT + float(found[3] or 0) * FOOT / 12 if found[2] in ("ft", "feet", "'") else value
+    value = float(match[1].replace(",", "."))
+    return value * FOOT + float(match[3] or 0) * FOOT / 12 if match[2] in ("ft", "feet", "'") else value
 
 
 def join_rings(parts: Sequence[NodeIds]) -> list[NodeIds] | None:

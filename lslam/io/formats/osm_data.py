@@ -27,7 +27,7 @@ class Way:
     tags: Mapping[str, str] = field(default_factory=dict)
 
     @property
-    def is_closed(self) -> bool:
+    def is_ring(self) -> bool:
         """True for a ring."""
         return len(self.nodes) > 1 and self.nodes[0] == self.nodes[-1]
 
@@ -56,7 +56,7 @@ class OsmData:
 
     attribution : the words every output made from it must carry; None for a simulated place, which nobody surveyed
     versions : by (kind, number), of elements that were edited before, which the database asks for; all others have 1
-    modified : (kind, number) of elements that differ from the database, as JOSM marks them in its files
+    edits : (kind, number) of elements that differ from the database, as JOSM marks them in its files
     """
 
     nodes: dict[int, tuple[float, float]] = field(default_factory=dict)
@@ -64,8 +64,8 @@ class OsmData:
     relations: dict[int, Relation] = field(default_factory=dict)
     attribution: str | None = ATTRIBUTION
     versions: dict[tuple[str, int], int] = field(default_factory=dict)
-    modified: set[tuple[str, int]] = field(default_factory=set)
-    _drawn: dict[int, list[tuple[float, float] | None]] = field(default_factory=dict, repr=False, compare=False)
+    edits: set[tuple[str, int]] = field(default_factory=set)
+    _outlines: dict[int, list[tuple[float, float] | None]] = field(default_factory=dict, repr=False, compare=False)
 
     def add_node(self, number: int, lat: Any, lon: Any) -> None:
         """Add a node; raises ValueError when it is not on the Earth."""
@@ -103,11 +103,11 @@ class OsmData:
             self.add_way(Way(number, nodes, tags))
         elif kind == "relation":
             members = element.get("members", ())
-            found = tuple(Member(str(m["type"]), int(m["ref"]), str(m.get("role", ""))) for m in members)
+            own = tuple(Member(str(m["type"]), int(m["ref"]), str(m.get("role", ""))) for m in members)
             for member in members:
                 if member["type"] == "way" and "geometry" in member:
                     self.draw_way(int(member["ref"]), member["geometry"])
-            self.add_relation(Relation(number, found, tags))
+            self.add_relation(Relation(number, own, tags))
 
     def draw_way(self, number: int, geometry: Iterable[Mapping[str, Any] | None]) -> None:
         """Store the positions of a way whose nodes have no numbers (Overpass' `out geom`).
@@ -115,16 +115,16 @@ class OsmData:
         Points outside the requested box are None.
         """
         places = [(float(p["lat"]), float(p["lon"])) if p and "lat" in p else None for p in geometry]
-        self._drawn.setdefault(number, places)
+        self._outlines.setdefault(number, places)
 
-    def number_drawn(self) -> None:
+    def number_outlines(self) -> None:
         """Give node numbers to ways that have positions only; call it after reading. Ways with missing parts stay undrawn.
 
         New nodes get negative numbers; existing nodes at the same position are reused.
         """
-        at = {place: number for number, place in self.nodes.items()} if self._drawn else {}
+        at = {place: number for number, place in self.nodes.items()} if self._outlines else {}
         fresh = min([0, *self.nodes]) - 1
-        for number, places in self._drawn.items():
+        for number, places in self._outlines.items():
             way = self.ways.get(number, Way(number, ()))
             if None in places or (way.nodes and all(node in self.nodes for node in way.nodes)):
                 continue
@@ -134,19 +134,19 @@ class OsmData:
                     at[place] = fresh
                     fresh -= 1
             self.ways[number] = replace(way, nodes=tuple(at[place] for place in places if place is not None))
-        self._drawn.clear()
+        self._outlines.clear()
 
 
 class AreaMaker:
     """Adds areas to `data`: one outline without holes is a way, all else a multipolygon.
 
     Nodes, and whatever has no number of its own, get numbers below zero, which no element of OpenStreetMap has, and none of
-    those `taken`. Where `shares_nodes`, corners at one place are one node.
+    those `numbers`. Where `shares_nodes`, corners at one place are one node.
     """
 
-    def __init__(self, data: OsmData, taken: Collection[int], shares_nodes: bool) -> None:
+    def __init__(self, data: OsmData, numbers: Collection[int], shares_nodes: bool) -> None:
         self._data, self._shares_nodes = data, shares_nodes
-        self._numbers = (number for number in count(-1, -1) if number not in taken)
+        self._numbers = (number for number in count(-1, -1) if number not in numbers)
         self._at: dict[Place, int] = {}
 
     def add(

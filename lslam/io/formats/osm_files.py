@@ -93,7 +93,7 @@ def _read_json(path: Path) -> OsmData:
         if not items.has_list and is_geojson(items.rest):
             return osm_from_outlines(items.rest)
         check_reply(items)
-        data.number_drawn()
+        data.number_outlines()
         return data
     except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(f"{path} is broken JSON, perhaps cut short ({error}): {WAY_OUT}") from None
@@ -139,7 +139,7 @@ def _parsed_xml(path: Path, stream: IO[Any]) -> OsmData:
         elif event == "end" and element.tag in ("node", "way", "relation"):
             _add_xml(data, element)
             root.clear()
-    data.number_drawn()
+    data.number_outlines()
     return data
 
 
@@ -149,7 +149,7 @@ def _add_xml(data: OsmData, element: Element) -> None:
         return
     number = int(element.attrib["id"])
     if element.get("action") == "modify":
-        data.modified.add((element.tag, number))
+        data.edits.add((element.tag, number))
     said: dict[str, Any] = {**element.attrib, "type": element.tag, "id": number}
     if element.tag != "node":
         said["tags"] = {tag.attrib["k"]: tag.attrib["v"] for tag in element.iter("tag")}
@@ -189,7 +189,7 @@ def _xml_lines(data: OsmData) -> Iterator[str]:
 
 
 def _identity(data: OsmData, kind: str, number: int) -> str:
-    action = ' action="modify"' if (kind, number) in data.modified else ""
+    action = ' action="modify"' if (kind, number) in data.edits else ""
     return f'id="{number}" version="{data.versions.get((kind, number), 1)}"{action}'
 
 
@@ -241,8 +241,8 @@ def _place(position: Any) -> Place:
     except (TypeError, ValueError, IndexError, KeyError):
         raise ValueError(f"{str(position)[:60]} is no position") from None
     if not is_on_earth(lat, lon):
-        is_swapped = abs(lon) <= 90 < abs(lat) <= 180
-        way_out = "GeoJSON has the longitude first, and then the latitude" if is_swapped else _REPROJECT
+        has_swapped_axes = abs(lon) <= 90 < abs(lat) <= 180
+        way_out = "GeoJSON has the longitude first, and then the latitude" if has_swapped_axes else _REPROJECT
         raise ValueError(f"{lon:g}, {lat:g} are no degrees of longitude and latitude: {way_out}")
     return lat, lon
 
@@ -265,15 +265,15 @@ def _areas(tree: Any, properties: Any = None, name: Any = None) -> Iterator[Area
         if not isinstance(polygons, list) or not all(isinstance(rings, list) for rings in polygons):
             raise ValueError(f"a {kind} without a list of rings")
         known = properties or {}
-        yield _named(known, name), _tags(known), [rings for rings in polygons if rings]
+        yield _identifier(known, name), _tags(known), [rings for rings in polygons if rings]
 
 
-def _named(properties: dict[str, Any], name: Any) -> tuple[str, int] | None:
+def _identifier(properties: dict[str, Any], name: Any) -> tuple[str, int] | None:
     """Kind and number in an identifier: `way/12` of Overpass turbo and lslam, a plain number of osmium and QGIS."""
     for value in (properties.get("@id"), properties.get("osm_id"), name):
-        found = re.fullmatch(r"(?:(way|relation)/)?(-?\d{1,18})", str(value))
-        if found:
-            return found[1] or "way", int(found[2])
+        match = re.fullmatch(r"(?:(way|relation)/)?(-?\d{1,18})", str(value))
+        if match:
+            return match[1] or "way", int(match[2])
     return None
 
 

@@ -106,14 +106,14 @@ def read_metadata(path: Path) -> OusterSensor:
 def parse_metadata(text: str | bytes, where: str) -> OusterSensor:
     """As `read_metadata`, from text; `where` names its source in messages."""
     try:
-        found = _flat(parse_json(text))
+        entries = _flat(parse_json(text))
     except MISFIT as error:
         raise InputError(f"{where} is no metadata of an Ouster sensor: {error}") from None
-    layout = str(found.get("udp_profile_lidar") or "LEGACY")
+    layout = str(entries.get("udp_profile_lidar") or "LEGACY")
     if layout not in PROFILES:
         raise InputError(f"{where}: packets of profile {layout} are not read; {', '.join(PROFILES)} are")
     try:
-        return _sensor(found, layout)
+        return _sensor(entries, layout)
     except MISFIT as error:
         raise InputError(
             f"{where} is no metadata of an Ouster sensor: beam_altitude_angles, beam_azimuth_angles and lidar_mode are needed "
@@ -123,34 +123,34 @@ def parse_metadata(text: str | bytes, where: str) -> OusterSensor:
 
 def _flat(tree: Any) -> dict[str, Any]:
     """Values by key with nested tables flattened: firmware 3 groups keys that older ones had side by side."""
-    found: dict[str, Any] = {}
+    entries: dict[str, Any] = {}
     if isinstance(tree, dict):
         for value in tree.values():
-            found.update(_flat(value))
-        found.update({key: value for key, value in tree.items() if not isinstance(value, dict)})
-    return found
+            entries.update(_flat(value))
+        entries.update({key: value for key, value in tree.items() if not isinstance(value, dict)})
+    return entries
 
 
-def _sensor(found: dict[str, Any], layout: str) -> OusterSensor:
-    width, rate = (int(word) for word in str(found["lidar_mode"]).split("x"))
-    width, columns = int(found.get("columns_per_frame") or width), int(found.get("columns_per_packet") or 16)
+def _sensor(entries: dict[str, Any], layout: str) -> OusterSensor:
+    width, rate = (int(word) for word in str(entries["lidar_mode"]).split("x"))
+    width, columns = int(entries.get("columns_per_frame") or width), int(entries.get("columns_per_packet") or 16)
     altitudes, azimuths = (
-        np.radians(np.array(found[f"beam_{name}_angles"], np.float64).reshape(-1)) for name in ("altitude", "azimuth")
+        np.radians(np.array(entries[f"beam_{name}_angles"], np.float64).reshape(-1)) for name in ("altitude", "azimuth")
     )
-    T_lidar_beam = found.get("beam_to_lidar_transform")
-    offset_mm = found.get("lidar_origin_to_beam_origin_mm")
+    T_lidar_beam = entries.get("beam_to_lidar_transform")
+    offset_mm = entries.get("lidar_origin_to_beam_origin_mm")
     if offset_mm is None:
         offset_mm = 0.0 if T_lidar_beam is None else np.array(T_lidar_beam, np.float64).ravel()[3]
     sensor = OusterSensor(
-        str(found.get("prod_line") or "Ouster"),
+        str(entries.get("prod_line") or "Ouster"),
         PROFILES[layout],
         columns,
         width,
         altitudes,
         azimuths,
         float(offset_mm) * 1e-3,
-        _transform(found.get("lidar_to_sensor_transform") or _LIDAR_TO_SENSOR),
-        _transform(found.get("imu_to_sensor_transform") or _IMU_TO_SENSOR),
+        _transform(entries.get("lidar_to_sensor_transform") or _LIDAR_TO_SENSOR),
+        _transform(entries.get("imu_to_sensor_transform") or _IMU_TO_SENSOR),
         float(rate),
     )
     numbers = (sensor.altitudes, sensor.azimuths, sensor.T_sensor_lidar, sensor.T_sensor_imu, np.array(sensor.offset_m))

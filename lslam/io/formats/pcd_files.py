@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from lslam.core.errors import InputError, input_errors
 from lslam.core.types.arrays import Floats
 from lslam.core.untrusted import whole_number
-from lslam.io.formats.point_cloud import AXES, beyond, organised, packed_columns, text_columns
+from lslam.io.formats.point_cloud import AXES, beyond, packed_columns, ring_column, text_columns
 
 ENCODINGS = ("binary", "ascii", "binary_compressed")
 _KINDS = {"F": (4, 8), "I": (1, 2, 4, 8), "U": (1, 2, 4, 8)}
@@ -55,7 +55,7 @@ def pcd_columns(path: Path) -> dict[str, NDArray[Any]]:
         columns = (_ascii_columns if header.encoding == "ascii" else _compressed_columns)(path, header, body)
     columns.pop("_", None)
     height, width = header.shape
-    return columns | (organised(height, width) if height * width == header.points else {})
+    return columns | (ring_column(height, width) if height * width == header.points else {})
 
 
 def pcd_header(count: int, kind: np.dtype[Any]) -> bytes:
@@ -209,7 +209,7 @@ def _compressed_columns(path: Path, header: _Header, body: memoryview) -> dict[s
             f"{path}: PCD compressed data are {len(body) - 8} bytes for {plain}, the header needs {packed} for "
             f"{header.points * header.dtype.itemsize}"
         )
-    from lslam.io.kernels.lzf import decompress
+    from lslam.io.kernels import decompress
 
     out = np.empty(plain, np.uint8)
     source = np.frombuffer(body[8 : 8 + packed], np.uint8).copy()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from mmap import mmap
 from pathlib import Path
@@ -56,46 +55,21 @@ def ply_columns(path: Path, data: bytes | mmap | None = None) -> dict[str, NDArr
     encoding, elements, size = _read_header(path, data)
     order = _ORDERS[encoding]
     body = memoryview(data)[size:]
-    skipped = 0
+    start = 0
     for element in elements:
         codes = [code for _, code in element.properties]
         if "list" in codes and (element.name == "vertex" or encoding != "ascii"):
             raise InputError(f"{path}: PLY element {element.name!r} has a list property where points are expected")
         if element.name == "vertex":
             if encoding == "ascii" and element.count:
-                return _ascii_columns(path, element, body, skipped, element is elements[-1])
+                return _ascii_columns(path, element, body, start, element is elements[-1])
             names = [name for name, _ in element.properties]
             dtype = np.dtype([(str(k), order + code) for k, code in enumerate(codes)])
             is_last = element is elements[-1]
-            return packed_columns(path, "PLY", names, dtype, element.count, body, skipped, is_last=is_last)
+            return packed_columns(path, "PLY", names, dtype, element.count, body, start, is_last=is_last)
         record = sum(np.dtype(code).itemsize for code in codes if code != "list")
-        skipped += element.count * (record if encoding != "ascii" else 1)
+        start += element.count * (record if encoding != "ascii" else 1)
     raise InputError(f"{path}: PLY header has no element 'vertex'")
-
-
-def write_ply(
-    path: Path,
-    points: NDArray[Any],
-    intensity: NDArray[Any] | None = None,
-    comment: str = "",
-    *,
-    scalars: Mapping[str, NDArray[Any]] | None = None,
-    colours: NDArray[np.uint8] | None = None,
-) -> None:
-    """Write points (N, 3), m, intensity (N,) and further `scalars` (N,) by name as float32, binary little endian, atomically.
-
-    colours : (N, 3) red, green, blue, which viewers show at once
-    """
-    columns = {**({} if intensity is None else {"intensity": intensity}), **(scalars or {})}
-    shades = {} if colours is None else dict(zip(("red", "green", "blue"), np.transpose(colours), strict=True))
-    table = np.empty(
-        len(points), [*((name, "<f4") for name in ("x", "y", "z", *columns)), *((name, "u1") for name in shades)]
-    )
-    for name, values in {**dict(zip("xyz", np.transpose(points), strict=True)), **columns, **shades}.items():
-        table[name] = values
-    with atomic_write(path) as stream:
-        stream.write(ply_header(len(table), table.dtype, comment))
-        stream.write(table.tobytes())
 
 
 def write_ply_mesh(path: Path, vertices: NDArray[Any], triangles: NDArray[Any], comment: str = "") -> None:
@@ -151,9 +125,9 @@ def _read_header(path: Path, data: bytes | mmap) -> tuple[str, list[_Element], i
 
 
 def _ascii_columns(
-    path: Path, element: _Element, body: memoryview, skipped: int, is_last: bool
+    path: Path, element: _Element, body: memoryview, start: int, is_last: bool
 ) -> dict[str, NDArray[Any]]:
-    every = [line for line in bytes(body).split(b"\n") if line.strip()][skipped:]
+    every = [line for line in bytes(body).split(b"\n") if line.strip()][start:]
     lines = every[: element.count]
     if len(lines) < element.count:
         raise InputError(f"{path}: PLY header says {element.count} points, the file holds {len(lines)}")

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from lslam.core.errors import InputError
 from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.scan import NO_RING, has_return
-from lslam.io.formats.time_columns import UNITS_NS
+from lslam.io.formats.time_columns import UNIT_OF, UNITS
 
 AXES = ("x", "y", "z")
 # Names as `plain_name` makes them, the likeliest first. docs/conventions.md, "Fields of points", says whose they are.
@@ -109,8 +109,6 @@ LABEL_NAMES = (
 )
 # FAST-LIO's clouds keep ms in a field that other software fills with the curvature of the surface.
 _DOUBTFUL_TIMES = {"curvature": "ms"}
-UNITS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}  # ns
-_UNIT_OF = {word: unit for word, ns in UNITS_NS.items() for unit in UNITS if UNITS[unit] == ns}
 # Before `_sec` and `_nsec`, where it is none of `TIME_NAMES`.
 _CLOCKS = ("", "lidar", "sensor", "point", "utc", "gps", "header", "epoch")
 ORGANISED = "(shorter side)"
@@ -176,7 +174,7 @@ class PointCloud:
         )
 
 
-def organised(rows: int, cols: int) -> dict[str, NDArray[Any]]:
+def ring_column(rows: int, cols: int) -> dict[str, NDArray[Any]]:
     """Ring of each point of an organised cloud, as a column along its shorter side; empty for an unorganised cloud."""
     if min(rows, cols) < 2:
         return {}
@@ -275,8 +273,8 @@ def plain_name(name: str) -> str:
     return re.sub(r"[^a-z0-9]+", "_", parted.lower()).strip("_").removeprefix("scalar_")
 
 
-def _first(names: Mapping[str, str], wanted: tuple[str, ...]) -> str | None:
-    return next((names[plain] for plain in wanted if plain in names), None)
+def _first(names: Mapping[str, str], plain_names: tuple[str, ...]) -> str | None:
+    return next((names[plain] for plain in plain_names if plain in names), None)
 
 
 def _find_rings(
@@ -336,7 +334,7 @@ def _part_unit(plain: str) -> tuple[str, str]:
     if plain in TIME_NAMES:
         return plain, ""
     clock, _, word = plain.rpartition("_")
-    return (clock, _UNIT_OF[word]) if word in _UNIT_OF and (clock or len(word) > 2) else (plain, "")
+    return (clock, UNIT_OF[word]) if word in UNIT_OF and (clock or len(word) > 2) else (plain, "")
 
 
 def _seconds_and(fine: str, name: str, seconds: NDArray[Any], parts: NDArray[Any]) -> Iterator[TimeColumn]:

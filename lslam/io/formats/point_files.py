@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection, Mapping
+import mmap
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from tokenize import TokenError
 from typing import Any
@@ -13,7 +16,7 @@ from numpy.typing import NDArray
 
 from lslam.core.errors import InputError, UsageError, input_errors
 from lslam.core.types.arrays import Floats
-from lslam.core.types.cloud import TIME_NS, ArrayCloud, Cloud, CloudBlock, Columns
+from lslam.core.types.cloud import BLOCK, TIME_NS, ArrayCloud, Cloud, CloudBlock, Columns
 from lslam.core.untrusted import MISFIT
 from lslam.io.formats.atomic import atomic_write
 from lslam.io.formats.las_files import open_las, read_las, write_las
@@ -34,6 +37,7 @@ LARGE_M, COARSE_M = 1e5, 0.01
 _FEW = 8
 _COLOURS = ("red", "green", "blue")
 log = logging.getLogger("lslam")
+COLOURING = ("red", "green", "blue", "class")
 
 
 def read_points(path: Path, record: PointRecord | None = None) -> PointCloud:
@@ -195,18 +199,36 @@ def write_cloud(path: Path, cloud: Cloud, *, comment: str = "", wkt: str = "") -
     if suffix not in MAP_SUFFIXES:
         raise UsageError(f"{path}: no map file lslam writes; known suffixes: {', '.join(MAP_SUFFIXES)}")
     is_ply = suffix == ".ply"
-    packed = dict if is_ply else packed_colour
-    kind = _record_type(cloud, packed)
+    pack = dict if is_ply else packed_colour
+    kind = _record_type(cloud, pack)
     with atomic_write(path) as stream:
         stream.write(ply_header(len(cloud), kind, comment) if is_ply else pcd_header(len(cloud), kind))
         for block in cloud.blocks():
-            stream.write(_records(block, kind, packed).tobytes())
+            stream.write(_records(block, kind, pack).tobytes())
 
 
-def _record_type(cloud: Cloud, packed: Callable[[Columns], Columns]) -> np.dtype[Any]:
+def write_ply(
+    path: Path,
+    points: NDArray[Any],
+    intensity: NDArray[Any] | None = None,
+    comment: str = "",
+    *,
+    scalars: Mapping[str, NDArray[Any]] | None = None,
+    colours: NDArray[np.uint8] | None = None,
+) -> None:
+    """Write points (N, 3), m, intensity (N,) and further `scalars` (N,) by name as float32, binary little endian, atomically.
+
+    colours : (N, 3) red, green, blue, which viewers show at once
+    """
+    columns: dict[str, NDArray[Any]] = {name: v.astype(np.float32) for name, v in (scalars or {}).items()}
+    columns |= {} if colours is None else dict(zip(_COLOURS, np.transpose(colours), strict=True))
+    write_cloud(path, replace(ArrayCloud.of(points, intensity), columns=columns), comment=comment)
+
+
+def _record_type(cloud: Cloud, pack: Callable[[Columns], Columns]) -> np.dtype[Any]:
     """Record of a point in PLY and PCD, its columns packed; times are seconds, since neither has integers of 64 bits."""
     names = [*AXES, "intensity"] if cloud.has_intensity else AXES
-    columns = packed({name: np.empty(0, kind) for name, kind in cloud.column_types.items()})
+    columns = pack({name: np.empty(0, kind) for name, kind in cloud.column_types.items()})
     further = [
         ("time", "<f8") if name == TIME_NS else (name, values.dtype.newbyteorder("<"))
         for name, values in columns.items()
@@ -214,8 +236,8 @@ def _record_type(cloud: Cloud, packed: Callable[[Columns], Columns]) -> np.dtype
     return np.dtype([*((name, "<f4") for name in names), *further])
 
 
-def _records(block: CloudBlock, kind: np.dtype[Any], packed: Callable[[Columns], Columns]) -> NDArray[Any]:
-    columns = packed(block.columns)
+def _records(block: CloudBlock, kind: np.dtype[Any], pack: Callable[[Columns], Columns]) -> NDArray[Any]:
+    columns = pack(block.columns)
     values = {**dict(zip(AXES, block.points.T, strict=True)), "intensity": block.intensity, **columns}
     if TIME_NS in values:
         values["time"] = 1e-9 * block.columns[TIME_NS]
@@ -260,8 +282,8 @@ def open_map(path: Path, attributes: Collection[str]) -> Cloud:
     if "time" in attributes and "time" in fields:
         columns[TIME_NS] = np.rint(1e9 * fields["time"]).astype(np.int64)
     if "rgb" in fields:
-        packed = np.ascontiguousarray(fields["rgb"]).view(np.uint32)
-        columns |= {name: (packed >> shift).astype(np.uint8) for name, shift in zip(_COLOURS, (16, 8, 0), strict=True)}
+        pack = np.ascontiguousarray(fields["rgb"]).view(np.uint32)
+        columns |= {name: (pack >> shift).astype(np.uint8) for name, shift in zip(_COLOURS, (16, 8, 0), strict=True)}
     return ArrayCloud(cloud.points, cloud.intensity, columns)
 
 
@@ -276,3 +298,70 @@ def coordinate_step(points: Floats) -> float:
             if np.abs(counted - np.round(counted)).max() < 0.01:
                 steps.append(float(between.min()))
     return max(steps)
+
+
+class ColumnCloud:
+    """A cloud of named columns (N,), which may be mapped from a file: `x`, `y`, `z`, `intensity` and those of `COLOURING`."""
+
+    def __init__(self, columns: Mapping[str, NDArray[Any]]) -> None:
+        self._columns = columns
+        self.column_types = {name: columns[name].dtype for name in COLOURING if name in columns}
+
+    def __len__(self) -> int:
+        return len(self._columns["x"])
+
+    @property
+    def has_intensity(self) -> bool:
+        """Whether there are intensities."""
+        return "intensity" in self._columns
+
+    def blocks(self) -> Iterator[CloudBlock]:
+        """All points, as arrays of their own."""
+        for begin in range(0, len(self), BLOCK):
+            part = {name: np.array(column[begin : begin + BLOCK]) for name, column in self._columns.items()}
+            points = np.column_stack([part[axis].astype(np.float64) for axis in "xyz"])
+            intensity = part["intensity"].astype(np.float32) if self.has_intensity else None
+            yield CloudBlock(points, intensity, {name: part[name] for name in self.column_types})
+
+
+class MapCloud:
+    """One map of one or several files of a kind, in the world that `to_world` takes their points (N, 3), m, to."""
+
+    def __init__(self, paths: Sequence[Path], to_world: Callable[[Floats], Floats] = lambda points: points) -> None:
+        self._paths, self._to_world = paths, to_world
+
+    @cached_property
+    def _parts(self) -> list[Cloud]:
+        return [stored_cloud(path) for path in self._paths]
+
+    @property
+    def has_intensity(self) -> bool:
+        """Whether all files have intensities."""
+        return all(part.has_intensity for part in self._parts)
+
+    @property
+    def column_types(self) -> Mapping[str, np.dtype[Any]]:
+        """Types of the columns that all files have."""
+        known = [part.column_types for part in self._parts]
+        return {name: kind for name, kind in known[0].items() if all(name in one for one in known)}
+
+    def __len__(self) -> int:
+        return sum(map(len, self._parts))
+
+    def blocks(self) -> Iterator[CloudBlock]:
+        """The blocks of one file after the other."""
+        for part in self._parts:
+            for block in part.blocks():
+                yield CloudBlock(self._to_world(block.points), block.intensity, block.columns)
+
+
+def stored_cloud(path: Path) -> Cloud:
+    """A map as lslam writes it. Of PLY, LAS and LAZ no more is held than a block; PCD is read whole.
+
+    Raises InputError naming the file when it is missing, damaged or of another kind, of LAS while its blocks are read.
+    """
+    if path.suffix.lower() != ".ply":
+        return open_map(path, ("class",))
+    with input_errors(path, ValueError, as_what="a map"), path.open("rb") as stream:
+        columns = ply_columns(path, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ))
+    return ColumnCloud(columns)

@@ -9,26 +9,27 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.errors import InputError, input_errors, nearest
 from lslam.core.geometry import so3
 from lslam.core.printable import toml_text
+from lslam.core.types.arrays import Floats
+from lslam.core.types.camera import MODELS, Lens
 from lslam.core.untrusted import parse_toml
 from lslam.io.formats.atomic import write_text
-from lslam.io.formats.camera_info import CameraInfo, camera_of
 from lslam.io.formats.point_records import parse_record
+from lslam.io.formats.time_columns import UNITS
 
 FILE_NAME = "sequence.toml"
 INSTANTS = ("scan_start", "scan_middle", "scan_end")
-UNITS = ("s", "ms", "us", "ns")
 LENGTHS = {"m": 1.0, "cm": 0.01, "mm": 0.001}  # m
 REFERENCES = ("start", "end", "absolute")
 POINT_TIMES = ("field", "columns", "order", "azimuth", "none")
 FRAMES = ("lidar", "cam0", "imu")
 EXTRINSICS = ("T_cam0_lidar", "T_lidar_imu", "T_lidar_gnss")
-
-Matrix = NDArray[np.float64]
+_NEEDED = ("images", "intrinsics", "T_lidar_camera")  # of a camera
+_LARGEST = 1e9  # of a number of a camera: seconds beyond have no stamps, pixels no image
+CAMERA_KEYS = (*_NEEDED, "stamps", "model", "distortion", "time_offset_s")
 
 
 def is_rate(rate_hz: float) -> bool:
@@ -51,13 +52,13 @@ def _is_record(value: Any) -> bool:
         return False
 
 
-def _key(is_valid: Callable[[Any], bool], expected: str) -> Any:
+def _key(is_valid: Callable[[Any], bool], form: str) -> Any:
     """Field of `SequenceInfo` for one key, with the check of its values."""
-    return field(default=None, metadata={"is_valid": is_valid, "expected": expected})
+    return field(default=None, metadata={"is_valid": is_valid, "expected": form})
 
 
-def _text(expected: str) -> Any:
-    return _key(_is_text, expected)
+def _text(form: str) -> Any:
+    return _key(_is_text, form)
 
 
 def _count() -> Any:
@@ -67,6 +68,40 @@ def _count() -> Any:
 def _one_of(choices: Iterable[str]) -> Any:
     names = list(choices)
     return _key(lambda v: v in names, f"one of {', '.join(names)}")
+
+
+@dataclass(frozen=True)
+class CameraInfo:
+    """What `sequence.toml` says of a camera.
+
+    images : folder of its images, in the order of their names; stamps : file with the stamp of each, relative to the sequence
+    model, intrinsics, distortion : as of `Lens`, whose size is that of the images
+    T_lidar_camera : (4, 4), camera axes x right, y down, z forward; time_offset_s : added to the stamps
+    """
+
+    images: str
+    intrinsics: tuple[float, float, float, float]
+    T_lidar_camera: Floats
+    stamps: str = ""
+    model: str = "pinhole"
+    distortion: tuple[float, ...] = ()
+    time_offset_s: float = 0.0
+
+    @property
+    def stamps_file(self) -> str:
+        """The stated file of stamps, else times.txt among the images."""
+        return self.stamps or f"{self.images}/times.txt"
+
+    def lens(self, size: tuple[int, int]) -> Lens:
+        """The lens of images of `size`, width and height."""
+        return Lens(self.model, size, self.intrinsics, self.distortion)
+
+    def tree(self) -> dict[str, Any]:
+        """Values for TOML."""
+        matrix = [[float(value) for value in row] for row in self.T_lidar_camera]
+        other = {key: getattr(self, key) for key in CAMERA_KEYS if key != "T_lidar_camera"}
+        plain = {key: list(value) if isinstance(value, tuple) else value for key, value in other.items()}
+        return {**{key: value for key, value in plain.items() if value not in ("", [], 0.0)}, "T_lidar_camera": matrix}
 
 
 @dataclass(frozen=True)
@@ -121,11 +156,11 @@ class SequenceInfo:
     lidar_frame: str | None = _text("a frame, or all")
     imu_topic: str | None = _text("a topic")
     gnss_topic: str | None = _text("a topic")
-    T_cam0_lidar: Matrix | None = None
-    T_lidar_imu: Matrix | None = None
-    T_lidar_gnss: Matrix | None = None
-    lidars: Mapping[str, Matrix] | None = None
-    frames: Mapping[str, Matrix] | None = None
+    T_cam0_lidar: Floats | None = None
+    T_lidar_imu: Floats | None = None
+    T_lidar_gnss: Floats | None = None
+    lidars: Mapping[str, Floats] | None = None
+    frames: Mapping[str, Floats] | None = None
     cameras: Mapping[str, CameraInfo] | None = None
 
     def over(self, other: SequenceInfo) -> SequenceInfo:
@@ -154,7 +189,7 @@ def parse_sequence_toml(text: str, path: Path | str) -> SequenceInfo:
         if key not in _KEYS:
             raise InputError(f"{path}: unknown key {key!r}; {nearest(key, [*_KEYS, *_TABLES])}")
         if not _KEYS[key]["is_valid"](value):
-            raise InputError(f"{path}: {key} = {value!r}, expected {_KEYS[key]['expected']}")
+            raise InputError(f"{path}: {key} = {value!r}, expected {_KEYS[key]['form']}")
         values[key] = float(value) if key in ("rate_hz", "vertical_correction_deg") else value
     for key, value in tables["extrinsics"].items():
         if key not in EXTRINSICS:
@@ -164,7 +199,7 @@ def parse_sequence_toml(text: str, path: Path | str) -> SequenceInfo:
         if tables[key]:
             values[key] = {name: _transform(path, f"{key}.{name}", T) for name, T in tables[key].items()}
     if tables["cameras"]:
-        values["cameras"] = {name: camera_of(path, name, T, _transform) for name, T in tables["cameras"].items()}
+        values["cameras"] = {name: _camera(path, name, T) for name, T in tables["cameras"].items()}
     if (values.get("rows") is None) != (values.get("cols") is None):
         raise InputError(f"{path}: rows and cols of organised clouds go together, one of them is missing")
     return SequenceInfo(**values)
@@ -179,7 +214,7 @@ def sequence_toml_text(info: SequenceInfo) -> str:
     """`info` as TOML, without keys that are None."""
     tree = {f.name: getattr(info, f.name) for f in fields(info) if f.name not in (*EXTRINSICS, *_TABLES)}
     extrinsics = {key: getattr(info, key) for key in EXTRINSICS}
-    tables: dict[str, Mapping[str, Matrix | None]] = {
+    tables: dict[str, Mapping[str, Floats | None]] = {
         "extrinsics": extrinsics,
         "lidars": info.lidars or {},
         "frames": info.frames or {},
@@ -201,7 +236,7 @@ _TABLES = {
 }
 
 
-def _transform(path: Path | str, key: str, value: Any) -> Matrix:
+def _transform(path: Path | str, key: str, value: Any) -> Floats:
     """3x4 or 4x4 rows, or the same numbers in one list, to a checked (4, 4) transform."""
     try:
         numbers = np.asarray(value, np.float64).ravel()
@@ -214,3 +249,45 @@ def _transform(path: Path | str, key: str, value: Any) -> Matrix:
     if not np.isfinite(numbers).all() or not so3.is_rotation(T[:3, :3], 1e-3):
         raise InputError(f"{path}: {key} is no rigid transform: its left 3x3 block is not a rotation")
     return T
+
+
+def _camera(path: Path | str, name: str, table: Any) -> CameraInfo:
+    """Camera of the table `[cameras.NAME]`. Raises InputError naming file and key."""
+    place = f"cameras.{name}"
+    if not isinstance(table, dict):
+        raise InputError(f"{path}: {place} is a table, write [{place}] and below it {', '.join(_NEEDED)}")
+    for key in table:
+        if key not in CAMERA_KEYS:
+            raise InputError(f"{path}: unknown key {place}.{key}; {nearest(key, CAMERA_KEYS)}")
+    for key in _NEEDED:
+        if key not in table:
+            what = "has no calibration" if key in ("intrinsics", "T_lidar_camera") else "has no images"
+            raise InputError(f"{path}: camera {name} {what}: {place}.{key} is missing")
+    for key in ("images", "stamps"):
+        if key in table and not _is_text(table[key]):
+            raise InputError(
+                f"{path}: {place}.{key} = {table[key]!r}, expected a {'folder' if key == 'images' else 'file'}"
+            )
+    model = table.get("model", "pinhole")
+    if model not in MODELS:
+        raise InputError(f"{path}: {place}.model = {model!r}, expected one of {', '.join(MODELS)}")
+    intrinsics = _numbers(path, f"{place}.intrinsics", table["intrinsics"], (4,), "fx, fy, cx, cy in pixels")
+    if not min(intrinsics[:2]) > 0:
+        raise InputError(f"{path}: {place}.intrinsics = {list(intrinsics)}: the focal lengths fx and fy are above 0")
+    counts = MODELS[model]
+    what = f"{' or '.join(map(str, counts))} coefficients of a {model}"
+    distortion = _numbers(path, f"{place}.distortion", table.get("distortion", []), counts, what)
+    (offset,) = _numbers(path, f"{place}.time_offset_s", [table.get("time_offset_s", 0.0)], (1,), "a number of seconds")
+    T = _transform(path, f"{place}.T_lidar_camera", table["T_lidar_camera"])
+    fx, fy, cx, cy = intrinsics
+    return CameraInfo(table["images"], (fx, fy, cx, cy), T, table.get("stamps", ""), model, distortion, offset)
+
+
+def _numbers(path: Path | str, key: str, value: Any, counts: tuple[int, ...], what: str) -> tuple[float, ...]:
+    try:
+        numbers = np.asarray(value, np.float64)
+    except (TypeError, ValueError, OverflowError):
+        numbers = np.full(1, np.nan)
+    if numbers.ndim != 1 or len(numbers) not in counts or not (np.abs(numbers) < _LARGEST).all():
+        raise InputError(f"{path}: {key} = {value!r}, expected {what}")
+    return tuple(numbers.tolist())

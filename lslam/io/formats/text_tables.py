@@ -159,13 +159,13 @@ def split_cells(text: str, separator: str | None) -> list[str]:
     """
     if separator is None:
         text = _DATE_AND_TIME.sub(r"\1T\2", text, count=1)
-    cells = [cell.strip().strip("\"'") for cell in _split(text, separator)]
+    cells = [cell.strip().strip("\"'") for cell in _cells_of(text, separator)]
     if separator != ",":
         cells = [cell.replace(",", ".") if _DECIMAL_COMMA.fullmatch(cell) else cell for cell in cells]
     return cells
 
 
-def _split(text: str, separator: str | None) -> list[str]:
+def _cells_of(text: str, separator: str | None) -> list[str]:
     """Split at separators, except within quotes."""
     if separator is not None and '"' in text:
         with suppress(csv.Error):

@@ -22,33 +22,15 @@ from lslam.io.remote import as_path
 log = logging.getLogger("lslam")
 # The columns of a time, one or two, and the nanoseconds in the unit of each, None where nothing states it.
 Units = dict[int, int | None]
-UNITS_NS = {
-    "ns": 1,
-    "nsec": 1,
-    "nsecs": 1,
-    "nanosec": 1,
-    "nanosecs": 1,
-    "nanosecond": 1,
-    "nanoseconds": 1,
-    "nanos": 1,
-    "us": 1_000,
-    "usec": 1_000,
-    "micros": 1_000,
-    "usecs": 1_000,
-    "microsec": 1_000,
-    "microsecs": 1_000,
-    "microseconds": 1_000,
-    "ms": 1_000_000,
-    "msec": 1_000_000,
-    "millis": 1_000_000,
-    "msecs": 1_000_000,
-    "milliseconds": 1_000_000,
-    "s": 1_000_000_000,
-    "sec": 1_000_000_000,
-    "secs": 1_000_000_000,
-    "second": 1_000_000_000,
-    "seconds": 1_000_000_000,
+UNITS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}  # ns
+_UNIT_WORDS = {
+    "s": ("sec", "secs", "second", "seconds"),
+    "ms": ("msec", "msecs", "millis", "milliseconds"),
+    "us": ("usec", "usecs", "micros", "microsec", "microsecs", "microseconds"),
+    "ns": ("nsec", "nsecs", "nanos", "nanosec", "nanosecs", "nanosecond", "nanoseconds"),
 }
+UNIT_OF = {word: unit for unit, words in _UNIT_WORDS.items() for word in (unit, *words)}
+UNITS_NS = {word: UNITS[unit] for word, unit in UNIT_OF.items()}
 SECOND_NS = 1_000_000_000
 _TIMES = ("t", "time", "times", "datetime", "epoch", "ts", "utc")
 # Poses, samples and scans are less than a minute apart.
@@ -77,13 +59,13 @@ def tokens_of(name: str) -> list[str]:
     return [word for word in re.split(r"[^a-z0-9]+", re.sub(r"[\[(].*?[\])]", "", name.lower())) if word]
 
 
-def find_clock(table: TextTable, taken: Collection[int] = (), default_ns: int | None = None) -> RowTimes | None:
+def find_clock(table: TextTable, other_columns: Collection[int] = (), default_ns: int | None = None) -> RowTimes | None:
     """Find the times of the rows, by column names or, without names, in the first columns; None when no column is a time.
 
-    taken : columns already used otherwise; default_ns : ns in a unit where the name states none, by size and step when None
+    other_columns : columns used otherwise; default_ns : ns in a unit where the name states none, by size and step when None
     Raises InputError with the line of a cell that is no time.
     """
-    candidates = _by_name(table, taken) if table.names else _by_place(table, taken)
+    candidates = _by_name(table, other_columns) if table.names else _by_place(table, other_columns)
     good = [c for c in candidates if _increases(np.sum([table.numbers(k) * (c[k] or 1) for k in c], axis=0))]
     # An index increases as well: it is the time only where nothing else is.
     is_dated = any(_is_since_1970(table.numbers(next(iter(c)))) for c in good)
@@ -188,10 +170,10 @@ def unit_ns_of(name: str) -> int | None:
     return UNITS_NS.get(words[-1]) if words else None
 
 
-def _by_name(table: TextTable, taken: Collection[int]) -> list[Units]:
+def _by_name(table: TextTable, other_columns: Collection[int]) -> list[Units]:
     words = [tokens_of(name) for name in table.names]
     width = len(table.rows[0].cells) if table.rows else len(words)
-    free = [k for k in range(min(len(words), width)) if k not in taken]
+    free = [k for k in range(min(len(words), width)) if k not in other_columns]
     ranked: list[tuple[int, bool, int, Units]] = []
     for k in free:
         # pandas writes its index without a name.
@@ -236,12 +218,12 @@ def _with_fraction(table: TextTable, words: list[list[str]], k: int, free: list[
     return {k: stated_ns}
 
 
-def _by_place(table: TextTable, taken: Collection[int]) -> list[Units]:
+def _by_place(table: TextTable, other_columns: Collection[int]) -> list[Units]:
     """Time columns by position in a table without names.
 
     They are a time, or seconds and nanoseconds, perhaps after an index or a text.
     """
-    width = min([3, *taken, *(len(row.cells) for row in table.rows)]) if table.rows else 0
+    width = min([3, *other_columns, *(len(row.cells) for row in table.rows)]) if table.rows else 0
     numbers = [table.numbers(k) for k in range(width)]
     out: list[Units] = []
     for k in range(width):

@@ -125,9 +125,9 @@ def pose_texts(trajectory: Trajectory, order: str) -> Iterator[list[str]]:
 def frame_in(comments: list[str]) -> str | None:
     """The frame that a comment states as `frame: NAME`, or None."""
     for comment in comments:
-        found = re.search(r"(?<![A-Za-z_])frame\s*[:=]\s*([A-Za-z_]\w*)", comment)
-        if found:
-            return found.group(1)
+        match = re.search(r"(?<![A-Za-z_])frame\s*[:=]\s*([A-Za-z_]\w*)", comment)
+        if match:
+            return match.group(1)
     return None
 
 

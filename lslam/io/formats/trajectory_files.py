@@ -8,23 +8,70 @@
 | `csv` | columns named in the header | by the name, or by size | by name | unknown |
 
 Stamps go between text and int64 ns without passing through a float. Matrices are kept as the file states them, so that
-numbers agree with tools that do the same.
+numbers agree with tools that do the same. A new format is a module with `fits_NAME`, `read_NAME` and `write_NAME`, and a line
+here.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from lslam.core.errors import InputError, UsageError, nearest
-from lslam.core.types.trajectory import Trajectory
-from lslam.io.formats.text_tables import read_table
-from lslam.io.formats.time_columns import read_times
-from lslam.io.formats.trajectory_csv import write_euroc
-from lslam.io.formats.trajectory_formats import FORMATS
-from lslam.io.formats.trajectory_lines import find_times, write_kitti, write_tum
 from lslam.io.remote import as_path
 
-__all__ = ["find_times", "read_times", "read_trajectory", "write_euroc", "write_kitti", "write_tum"]
+if TYPE_CHECKING:
+    from lslam.core.types.trajectory import Trajectory
+    from lslam.io.formats.text_tables import TextTable
+
+
+@dataclass(frozen=True)
+class TrajectoryFormat:
+    """One trajectory format; its module is imported on first use.
+
+    module : with `fits_NAME(first line)`, `read_NAME(table, times)` and `write_NAME(path, trajectory)`
+    frame : the body whose poses it holds by convention, empty where the file says
+    has_stamps : whether a file holds them
+    """
+
+    name: str
+    module: str
+    frame: str = ""
+    has_stamps: bool = True
+
+    @property
+    def fits(self) -> Callable[[str], bool]:
+        """Whether a file with this first line of data may be of the format."""
+        return self._function("fits")
+
+    @property
+    def read(self) -> Callable[[TextTable, Path | None], Trajectory]:
+        """Read the trajectory of a table; `times` names a file of stamps."""
+        return self._function("read")
+
+    @property
+    def write(self) -> Callable[[Path, Trajectory], None]:
+        """Write a file, atomically."""
+        return self._function("write")
+
+    def _function(self, verb: str) -> Callable[..., Any]:
+        function: Callable[..., Any] = getattr(import_module(self.module), f"{verb}_{self.name}")
+        return function
+
+
+# Asked in this order whether they fit.
+FORMATS = {
+    one.name: one
+    for one in (
+        TrajectoryFormat("kitti", "lslam.io.formats.trajectory_lines", frame="cam0", has_stamps=False),
+        TrajectoryFormat("tum", "lslam.io.formats.trajectory_lines"),
+        TrajectoryFormat("euroc", "lslam.io.formats.trajectory_csv", frame="imu"),
+        TrajectoryFormat("csv", "lslam.io.formats.trajectory_csv"),
+    )
+}
 
 
 def read_trajectory(path: str | Path, format: str | None = None, times: str | Path | None = None) -> Trajectory:  # noqa: A002
@@ -42,6 +89,8 @@ def read_trajectory(path: str | Path, format: str | None = None, times: str | Pa
     InputError naming file and line: missing, empty, short lines, NaN, no rotation, stamps that do not increase.
     UsageError for an unknown `format`.
     """
+    from lslam.io.formats.text_tables import read_table
+
     path = as_path(path)
     if path.is_dir():
         if not (path / "trajectory.tum").is_file():

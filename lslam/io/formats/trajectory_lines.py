@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from lslam.core.errors import InputError
-from lslam.core.geometry import so3
-from lslam.core.types.arrays import Longs
+from lslam.core.geometry import noise, so3
+from lslam.core.types.arrays import Floats, Longs
+from lslam.core.types.constraint import Constraint
 from lslam.core.types.trajectory import Trajectory
 from lslam.io.formats import trajectory_csv
 from lslam.io.formats.atomic import write_text
@@ -23,6 +25,10 @@ log = logging.getLogger("lslam")
 NOMINAL_STEP_NS = 100_000_000
 # A 3x4 or a 4x4 matrix, alone or behind one number.
 WIDTHS = (12, 13, 16, 17)
+_UPPER = np.triu_indices(6)
+# From gtsam's order of `noise.to_body` (rotation first) to g2o's, and from rad to the quaternion's vector part.
+_ORDER = np.array([3, 4, 5, 0, 1, 2])
+_HALF = np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.5])
 
 
 def fits_kitti(first: str) -> bool:
@@ -51,7 +57,7 @@ def read_kitti(table: TextTable, times: Path | None) -> Trajectory:
         stamps_ns = _stamps_of_kitti(table.path, scans_of(trajectory), times)
         if stamps_ns is not None:
             trajectory = replace(trajectory, stamps_ns=stamps_ns, has_stamps=True)
-    return without_lost(trajectory)
+    return drop_lost_poses(trajectory)
 
 
 def scans_of(trajectory: Trajectory) -> Longs:
@@ -59,7 +65,7 @@ def scans_of(trajectory: Trajectory) -> Longs:
     return trajectory.stamps_ns // NOMINAL_STEP_NS
 
 
-def without_lost(trajectory: Trajectory) -> Trajectory:
+def drop_lost_poses(trajectory: Trajectory) -> Trajectory:
     """Poses without NaN, and a note about the ones left out."""
     lost = np.asarray(np.isnan(trajectory.poses).any(axis=(1, 2)), np.bool_)
     if not lost.any():
@@ -98,7 +104,7 @@ def read_matrices(table: TextTable) -> Trajectory:
         how = how if width == size else f"the number of the scan, then {how}"
         stamps_ns = scans.astype(np.int64) * NOMINAL_STEP_NS
     else:
-        clock = find_clock(table, taken=[1])
+        clock = find_clock(table, other_columns=[1])
         assert clock is not None
         how, stamps_ns = f"the time, then {how}", clock.stamps_ns
         table.check_increasing(stamps_ns)
@@ -160,3 +166,22 @@ def _stamps_of_kitti(path: Path, scans: Longs, times: Path | None) -> Longs | No
         )
     log.warning("%s has %d stamps but %s has %d poses: not used", source, len(stamps_ns), path, len(scans))
     return None
+
+
+def write_g2o(path: Path, poses: Floats, constraints: Sequence[Constraint]) -> None:
+    """Write poses (K, 4, 4), m, as vertices 0..K-1, the first one fixed, and constraints as edges.
+
+    Raises OutputError when the file cannot be written.
+    """
+    lines = [f"VERTEX_SE3:QUAT {k} {_pose_text(pose)}" for k, pose in enumerate(poses)]
+    lines += ["FIX 0"] if len(poses) else []
+    for c in constraints:
+        body = noise.to_body(c.covariance, c.T_a_b)[np.ix_(_ORDER, _ORDER)] * np.outer(_HALF, _HALF)
+        information = np.linalg.inv(body)
+        values = " ".join(f"{v:.9g}" for v in (0.5 * (information + information.T))[_UPPER])
+        lines.append(f"EDGE_SE3:QUAT {c.a} {c.b} {_pose_text(c.T_a_b)} {values}")
+    write_text(path, "\n".join(lines) + "\n")
+
+
+def _pose_text(T: Floats) -> str:
+    return " ".join(f"{v:.12g}" for v in (*T[:3, 3], *so3.to_quaternion(T[:3, :3])))

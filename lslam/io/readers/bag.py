@@ -21,10 +21,9 @@ from lslam.io.formats import bag_streams
 from lslam.io.formats.bag_files import INFO_TOPIC, Bag, BagTopic, open_bag, read_header
 from lslam.io.formats.bag_listing import list_bag_files, parts_beside, stem_of
 from lslam.io.formats.bag_streams import Stream, chain, is_static, read_poses
-from lslam.io.formats.packet_messages import is_decoded
 from lslam.io.formats.point_cloud import TIME_NAMES, PointCloud
+from lslam.io.formats.sensor_messages import can_decode
 from lslam.io.formats.sequence_toml import LENGTHS, SequenceInfo, parse_sequence_toml
-from lslam.io.readers.bag_cameras import bag_cameras
 from lslam.io.readers.bag_lidars import UNNAMED, Halves, Links, ScanIndex, choose_lidars, places_of, put_together
 from lslam.io.readers.bag_packets import open_packets
 from lslam.io.readers.bag_topics import (
@@ -37,10 +36,11 @@ from lslam.io.readers.bag_topics import (
     load_companion,
     put_in_order,
 )
+from lslam.io.readers.cameras import bag_cameras
 from lslam.io.readers.clocks import ahead_of
 from lslam.io.readers.ground_truth import Voice
 from lslam.io.readers.listing import measured_rate
-from lslam.io.readers.pcap_revolutions import Opened, Revolutions, read_scan
+from lslam.io.readers.pcap_revolutions import Revolutions, SpinningSensor, read_scan
 from lslam.io.readers.point_clock import (
     onto_recording,
     open_clock,
@@ -108,12 +108,12 @@ class BagSequence(SequenceOnDisk):
         cloud, shift, _ = put_together(self.bag, self.topic, (k, *self.halves.get(k, ())))
         return in_metres(cloud, self.unit_m), shift
 
-    def ahead(self, stamps: Longs, recorded: Longs, what: str) -> int:
+    def ahead(self, stamps: Longs, recording_ns: Longs, what: str) -> int:
         """Offset of the clock of another stream from that of the scans, ns, positive if ahead; see `ahead_of`."""
         if self.revolutions is not None:
             return 0
         voice = Voice(self.notes, self.problems)
-        return ahead_of(self.headers_ns, self.recorded_ns, stamps, recorded, what, voice)
+        return ahead_of(self.headers_ns, self.recorded_ns, stamps, recording_ns, what, voice)
 
     def on_its_clock(self, stream: Stream, what: str) -> Stream:
         """Another stream with its stamps shifted to the clock of the scans."""
@@ -121,7 +121,7 @@ class BagSequence(SequenceOnDisk):
 
 
 # One LiDAR of a bag: which messages, its scans, and what its packets tell where it has any.
-_Lidar = tuple[ScanIndex, BagSequence, Opened | None]
+_Lidar = tuple[ScanIndex, BagSequence, SpinningSensor | None]
 
 
 def locate(path: Path) -> tuple[Path, str] | None:
@@ -162,8 +162,8 @@ def open_folder(path: Path, overrides: SequenceInfo, why: str) -> Sequence:
         frames = ", ".join(index.name for index, _, _ in some)
         voice.notes.insert(at, f"scans from {topic.name} ({topic.type}, {len(topic)} messages), frame {frames}")
         lidars += some
-    (leading, sequence, opened), frame = lidars[0], lidars[0][0].frame
-    own = opened if info.imu_topic is None else None
+    (leading, sequence, spinning), frame = lidars[0], lidars[0][0].frame
+    own = spinning if info.imu_topic is None else None
     imu = load_companion(bag, IMU, info.imu_topic, voice) if own is None or own.imu is None else None
     gnss = load_companion(bag, GNSS, info.gnss_topic, voice)
     if imu is not None:
@@ -198,24 +198,26 @@ def open_folder(path: Path, overrides: SequenceInfo, why: str) -> Sequence:
 
 def _lidars_of(bag: Bag, topic: BagTopic, info: SequenceInfo, voice: Voice, has_leading: bool) -> list[_Lidar]:
     """LiDARs of a topic that are read. What `info` states about the sensor applies to the leading one."""
-    if is_decoded(topic):
+    if can_decode(topic):
         turns, frame = open_packets(bag, topic, voice)
         stamps = turns.revolutions.stamps_ns
         ((name, _),) = choose_lidars(topic, [frame or UNNAMED], info.lidar_frame, voice)
         whole = ScanIndex(topic, name, frame, np.arange(len(stamps)), stamps, {})
-        sources: list[tuple[ScanIndex, Opened | None]] = [(whole, turns)]
+        sources: list[tuple[ScanIndex, SpinningSensor | None]] = [(whole, turns)]
     else:
         sources = [(index, None) for index in index_scans(bag, topic, info.lidar_frame, voice)]
     lidars: list[_Lidar] = []
-    for index, opened in sources:
+    for index, spinning in sources:
         if lidars or has_leading:
             info, voice = replace(info, rate_hz=None, rings=None, sensor=None), Voice([], [])
-        lidars.append((index, _scans_of(bag, index, opened, info, voice), opened))
+        lidars.append((index, _scans_of(bag, index, spinning, info, voice), spinning))
     return lidars
 
 
-def _scans_of(bag: Bag, index: ScanIndex, opened: Opened | None, info: SequenceInfo, voice: Voice) -> BagSequence:
-    """Scans of one LiDAR, from the packets `opened` or from messages, without IMU and fixes."""
+def _scans_of(
+    bag: Bag, index: ScanIndex, spinning: SpinningSensor | None, info: SequenceInfo, voice: Voice
+) -> BagSequence:
+    """Scans of one LiDAR, from the packets `spinning` or from messages, without IMU and fixes."""
     sequence = BagSequence(
         name=info.name or printable(stem_of(bag.path)),
         path=bag.path,
@@ -225,19 +227,19 @@ def _scans_of(bag: Bag, index: ScanIndex, opened: Opened | None, info: SequenceI
         messages=index.messages,
         headers_ns=index.stamps_ns,
         stamps_ns=index.stamps_ns,
-        rate_hz=info.rate_hz or (opened.rate_hz if opened else measured_rate(index.stamps_ns)),
+        rate_hz=info.rate_hz or (spinning.rate_hz if spinning else measured_rate(index.stamps_ns)),
         motion_compensated=info.motion_compensated,
-        rings=info.rings or (opened.rings if opened else None),
-        sensor=info.sensor or (opened.sensor if opened else None),
-        revolutions=opened.revolutions if opened else None,
+        rings=info.rings or (spinning.rings if spinning else None),
+        sensor=info.sensor or (spinning.sensor if spinning else None),
+        revolutions=spinning.revolutions if spinning else None,
         notes=voice.notes,
         problems=voice.problems,
         halves=index.halves,
         stated_times=stated_times(info),
         unit_m=LENGTHS.get(info.point_unit or ""),
-        uses=dict(opened.uses) if opened else {},
+        uses=dict(spinning.uses) if spinning else {},
     )
-    if opened is not None:
+    if spinning is not None:
         return sequence
     settle_unit(sequence)
     ends = {
@@ -258,7 +260,7 @@ def _uses(sequence: BagSequence, imu: Stream | None, gnss: Stream | None, links:
     """Purpose of each topic, by its name."""
     uses = {INFO_TOPIC: "sequence.toml", **sequence.uses}
     for topic in sequence.bag.of_type("TFMessage"):
-        if links.static if is_static(topic) else links.is_tf_used:
+        if links.static if is_static(topic) else links.uses_tf:
             uses[topic.name] = "extrinsics"
     if sequence.ground_truth is not None:
         uses[truth_topics(sequence.bag)[0].name] = "ground truth"
@@ -315,8 +317,8 @@ def find_extrinsics(
     """
     names = {name for pair in links.static for name in pair} - {lidar}
     frames = {name: T for name in sorted(names) if (T := chain(links.static, lidar, name)) is not None}
-    found = calibration_over(info, Calibration(T_cam0_lidar=chain(links.static, CAMERA, lidar), frames=frames))
-    T_lidar_imu, T_lidar_gnss = found.T_lidar_imu, found.T_lidar_gnss
+    calibration = calibration_over(info, Calibration(T_cam0_lidar=chain(links.static, CAMERA, lidar), frames=frames))
+    T_lidar_imu, T_lidar_gnss = calibration.T_lidar_imu, calibration.T_lidar_gnss
     is_assumed = False
     if imu is not None and T_lidar_imu is None:
         T_lidar_imu = _find(links, lidar, imu.frame, "IMU", voice)
@@ -330,9 +332,9 @@ def find_extrinsics(
         T_lidar_gnss = _find(links, lidar, gnss.frame, "GNSS", voice)
         if T_lidar_gnss is None:
             voice.notes.append(f"extrinsics: {links.why_not(lidar, gnss.frame)}: the place of the antenna is unknown")
-    own = replace(found, T_lidar_imu=T_lidar_imu, T_lidar_gnss=T_lidar_gnss, frames={})
+    own = replace(calibration, T_lidar_imu=T_lidar_imu, T_lidar_gnss=T_lidar_gnss, frames={})
     return replace(
-        own, frames={name: T for name, T in found.frames.items() if name not in own.poses_in_lidar()}
+        own, frames={name: T for name, T in calibration.frames.items() if name not in own.poses_in_lidar()}
     ), is_assumed
 
 

@@ -21,7 +21,7 @@ from lslam.core.types.scan import NO_RING, has_return
 from lslam.io.formats.bag_files import Bag, BagTopic, read_header
 from lslam.io.formats.bag_streams import Transforms, chain, is_static, read_transforms
 from lslam.io.formats.point_cloud import PointCloud
-from lslam.io.formats.pointcloud2 import decode_livox, decode_pointcloud2
+from lslam.io.formats.sensor_messages import decode_livox, decode_pointcloud2
 from lslam.io.readers.ground_truth import Voice
 
 ALL = "all"
@@ -69,20 +69,20 @@ def name_lidars(frames: Sequence[str], ids: Sequence[int | None]) -> list[str]:
     ]
 
 
-def choose_lidars(topic: BagTopic, names: Sequence[str], wanted: str | None, voice: Voice) -> list[tuple[str, Bools]]:
+def choose_lidars(topic: BagTopic, names: Sequence[str], choice: str | None, voice: Voice) -> list[tuple[str, Bools]]:
     """LiDARs of a topic that are read, the leading one first: their names, and (N,) bool which messages are theirs.
 
-    names : (N,) of the sensor of each message; wanted : names with commas between them, `all`, or None
+    names : (N,) of the sensor of each message; choice : names with commas between them, `all`, or None
 
-    If `wanted` is None the LiDAR with the most messages is read, and the others are named in the problems. A name that
+    If `choice` is None the LiDAR with the most messages is read, and the others are named in the problems. A name that
     replaces another in the middle of the recording is the same LiDAR. Raises UsageError for names that the topic does not
     have.
     """
     counts = Counter(names)
     changes = [k for k, (a, b) in enumerate(pairwise(names), 1) if a != b]
     first, *others = (name for name, _ in counts.most_common())
-    if wanted not in (None, ALL):
-        chosen = _parse_frames(topic, counts, str(wanted))
+    if choice not in (None, ALL):
+        chosen = _parse_frames(topic, counts, str(choice))
     elif len(changes) < len(counts):
         if changes:
             voice.problems.append(
@@ -90,7 +90,7 @@ def choose_lidars(topic: BagTopic, names: Sequence[str], wanted: str | None, voi
                 "taken for one LiDAR that was renamed; --lidar-frame takes the scans of one name"
             )
         return [(names[0], np.ones(len(names), np.bool_))]
-    elif wanted == ALL:
+    elif choice == ALL:
         chosen = [first, *others]
     else:
         chosen = [first]
@@ -102,14 +102,14 @@ def choose_lidars(topic: BagTopic, names: Sequence[str], wanted: str | None, voi
     return [(name, np.array(names) == name) for name in chosen]
 
 
-def _parse_frames(topic: BagTopic, counts: Counter[str], wanted: str) -> list[str]:
+def _parse_frames(topic: BagTopic, counts: Counter[str], choice: str) -> list[str]:
     """Names in the option --lidar-frame, without repetitions. Raises UsageError for a name that the topic lacks."""
-    chosen = [name.strip().lstrip("/") for name in wanted.split(",")]
+    chosen = [name.strip().lstrip("/") for name in choice.split(",")]
     strange = [name for name in chosen if name not in counts]
     if strange:
         flags = "\n".join(f"  --lidar-frame {name}  ({count} messages)" for name, count in counts.items())
         raise UsageError(
-            f"--lidar-frame {wanted}: no message of {topic.name} is of {strange[0]!r}; choose among:\n{flags}"
+            f"--lidar-frame {choice}: no message of {topic.name} is of {strange[0]!r}; choose among:\n{flags}"
         )
     return list(dict.fromkeys(chosen))
 
@@ -242,13 +242,13 @@ def _when(times: NDArray[Any]) -> tuple[float, float, float]:
 class Links:
     """Transforms between frames; /tf is read when /tf_static does not lead from one to the other.
 
-    static : of /tf_static; is_tf_used : whether a chain went over /tf
+    static : of /tf_static; uses_tf : whether a chain went over /tf
     """
 
     bag: Bag
     voice: Voice
     static: Transforms = field(default_factory=dict)
-    is_tf_used: bool = False
+    uses_tf: bool = False
 
     def __post_init__(self) -> None:
         """Read /tf_static; name pairs of frames with contradicting transforms."""
@@ -271,7 +271,7 @@ class Links:
         if not a or not b:
             return None
         if (T := chain(self._still, a, b)) is not None:
-            self.is_tf_used = True
+            self.uses_tf = True
             return T, "from /tf, which always says the same of it"
         return None
 
@@ -305,26 +305,26 @@ class Links:
 
     def _read(self, wants_static: bool, most: int | None = None) -> Transforms:
         problems = self.voice.problems if most is None else []
-        found: dict[tuple[str, str], list[Floats]] = {}
+        poses_of: dict[tuple[str, str], list[Floats]] = {}
         for topic in self.bag.of_type("TFMessage"):
             if is_static(topic) == wants_static:
                 for pair, poses in read_transforms(self.bag, topic, problems, most).items():
-                    found.setdefault(pair, []).append(poses)
-        return {pair: np.concatenate(pieces) for pair, pieces in found.items()}
+                    poses_of.setdefault(pair, []).append(poses)
+        return {pair: np.concatenate(pieces) for pair, pieces in poses_of.items()}
 
 
 def places_of(
-    lidars: Sequence[ScanIndex], links: Links, stated: Mapping[str, Floats] | None
+    lidars: Sequence[ScanIndex], links: Links, places_in_toml: Mapping[str, Floats] | None
 ) -> list[tuple[Floats, str]]:
     """`T_leading_other` (4, 4) of each LiDAR after the first, which leads, and their sources in words.
 
-    stated : `T_lidar_other` by frame or topic. If all LiDARs but one are named, the transforms are relative to that one.
+    places_in_toml : `T_lidar_other` by frame or topic. If all LiDARs but one are named, the transforms are relative to that one.
 
     Raises InputError for a LiDAR without a known place. A shared frame proves nothing: the clouds may be in it already, or
     the drivers may all use one name.
     """
-    named = [(stated or {}).get(one.name, (stated or {}).get(one.topic.name)) for one in lidars]
-    if stated and sum(T is None for T in named) == 1:
+    named = [(places_in_toml or {}).get(one.name, (places_in_toml or {}).get(one.topic.name)) for one in lidars]
+    if places_in_toml and sum(T is None for T in named) == 1:
         named = [np.eye(4) if T is None else T for T in named]
     leading, T_lidar_leading = lidars[0], named[0]
     places = []
@@ -347,7 +347,7 @@ def places_of(
     return places
 
 
-def _spread(poses: Floats) -> tuple[float, float]:
+def _largest_difference(poses: Floats) -> tuple[float, float]:
     """Largest difference of poses (N, 4, 4) from the first: m, rad."""
     off = se3.inverse(poses[0]) @ poses
     metres, turns = (np.linalg.norm(part, axis=1) for part in (off[:, :3, 3], so3.log(off[:, :3, :3])))
@@ -355,9 +355,9 @@ def _spread(poses: Floats) -> tuple[float, float]:
 
 
 def _is_still(poses: Floats) -> bool:
-    return max(_spread(poses)) <= _STILL
+    return max(_largest_difference(poses)) <= _STILL
 
 
 def _spread_text(poses: Floats) -> str:
-    metres, turn = _spread(poses)
+    metres, turn = _largest_difference(poses)
     return f"{metres:.3f} m and {np.degrees(turn):.1f} deg apart"

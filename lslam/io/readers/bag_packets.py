@@ -17,9 +17,9 @@ from lslam.io.formats import velodyne_packets
 from lslam.io.formats.bag_files import Bag, BagTopic
 from lslam.io.formats.bag_streams import read_text
 from lslam.io.formats.ouster_packets import OusterSensor, parse_metadata, read_metadata
-from lslam.io.formats.packet_messages import PACKET, SCANS, is_imu, read_packets
+from lslam.io.formats.sensor_messages import PACKET, SCANS, is_imu, read_packets
 from lslam.io.readers.ground_truth import Voice
-from lslam.io.readers.pcap_revolutions import Opened, metadata_beside, open_velodyne, open_with_metadata
+from lslam.io.readers.pcap_revolutions import SpinningSensor, metadata_beside, open_velodyne, open_with_metadata
 
 # The frame of the points that `lslam.io.formats.ouster_packets` makes, as its driver calls it.
 _OUSTER_FRAME = "os_sensor"
@@ -58,7 +58,7 @@ class BagPackets:
         return np.concatenate(rows) if rows else np.zeros((0, 0), np.uint8)
 
 
-def open_packets(bag: Bag, topic: BagTopic, voice: Voice) -> tuple[Opened, str]:
+def open_packets(bag: Bag, topic: BagTopic, voice: Voice) -> tuple[SpinningSensor, str]:
     """The revolutions on `topic`, and the frame of their points.
 
     Raises InputError when no packet is whole or known, or the metadata of an Ouster sensor are missing.

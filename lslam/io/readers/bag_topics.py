@@ -15,8 +15,7 @@ from lslam.core.types.arrays import Bools, Stamps
 from lslam.io.formats.bag_files import Bag, BagTopic, Header, read_header
 from lslam.io.formats.bag_listing import missing_parts
 from lslam.io.formats.bag_streams import Stream, read_fixes, read_imu
-from lslam.io.formats.packet_messages import is_packets, maker_by_name, not_decoded, packet_topics
-from lslam.io.formats.pointcloud2 import livox_id
+from lslam.io.formats.sensor_messages import decoding_advice, is_packets, livox_id, maker_by_name, packet_topics
 from lslam.io.formats.text_tables import seconds_text
 from lslam.io.readers.bag_lidars import ScanIndex, choose_lidars, find_halves, name_lidars
 from lslam.io.readers.clocks import MESSAGES_PER_STAMP, Clock, agree, runs, say_jitter, stands_still
@@ -31,17 +30,17 @@ _APART_NS = 60 * 10**9  # parts of one recording follow each other sooner
 _FEW = 4  # messages that may come late at the seam of two parts
 
 
-def choose_clouds(bag: Bag, wanted: str | None, voice: Voice) -> list[BagTopic]:
-    """The topics `wanted`, or the only one with clouds; where there are none, the only one with packets that are decoded.
+def choose_clouds(bag: Bag, choice: str | None, voice: Voice) -> list[BagTopic]:
+    """The topics `choice`, or the only one with clouds; where there are none, the only one with packets that are decoded.
 
-    wanted : names with commas between them
+    choice : names with commas between them
 
-    Raises UsageError listing the flags when there are several or one of `wanted` is not there, InputError when there is none.
+    Raises UsageError listing the flags when there are several or one of `choice` is not there, InputError when there is none.
     """
     clouds, packets = bag.of_type(*CLOUDS), packet_topics(bag)
-    if wanted is not None:
-        names = dict.fromkeys(name.strip() for name in wanted.split(","))
-        return [_named(bag, clouds + packets, name, "--lidar-topic", "clouds") for name in names]
+    if choice is not None:
+        names = dict.fromkeys(name.strip() for name in choice.split(","))
+        return [_find_topic(bag, clouds + packets, name, "--lidar-topic", "clouds") for name in names]
     if clouds and packets:
         left_out = ", ".join(t.name for t in packets)
         voice.notes.append(f"raw packets on {left_out} are left out, for there are clouds; --lidar-topic reads them")
@@ -57,7 +56,7 @@ def choose_clouds(bag: Bag, wanted: str | None, voice: Voice) -> list[BagTopic]:
     nameless = [t for t in bag.topics if len(t) and not t.type]
     if raw:
         where = f" on {raw[0].name} ({raw[0].type}, {len(raw[0])} messages)"
-        raise InputError(f"{bag.path} holds {not_decoded(maker_by_name(raw[0].name, raw[0].type), where)}")
+        raise InputError(f"{bag.path} holds {decoding_advice(maker_by_name(raw[0].name, raw[0].type), where)}")
     if nameless:
         raise InputError(
             f"{bag.path} lacks the type definition of {', '.join(t.name for t in nameless)} and has no other clouds: record it "
@@ -106,14 +105,14 @@ IMU = Companion("IMU", "--imu-topic", "Imu", read_imu, "--imu")
 GNSS = Companion("GNSS", "--gnss-topic", "NavSatFix", read_fixes, "--gnss and --georeference")
 
 
-def load_companion(bag: Bag, kind: Companion, wanted: str | None, voice: Voice) -> Stream | None:
-    """Stream of topic `wanted`, or of the only topic of its kind.
+def load_companion(bag: Bag, kind: Companion, choice: str | None, voice: Voice) -> Stream | None:
+    """Stream of topic `choice`, or of the only topic of its kind.
 
     None, with a problem in `voice`, when there are several topics or no usable samples.
     """
     topics = bag.of_type(*kind.type.split(" or "))
-    if wanted is not None:
-        topics = [_named(bag, topics, wanted, kind.flag, f"{kind.type} messages")]
+    if choice is not None:
+        topics = [_find_topic(bag, topics, choice, kind.flag, f"{kind.type} messages")]
     if len(topics) > 1:
         voice.problems.append(
             f"{kind.name}: {len(topics)} topics have one, none is used until one is chosen:\n{_flags(topics, kind.flag)}"
@@ -142,7 +141,7 @@ def why_none(bag: Bag, kind: Companion) -> LslamError:
     return InputError(f"{bag.path} has no {kind.name}: {fact}; {_listing(bag)}; run without {kind.wish}")
 
 
-def index_scans(bag: Bag, topic: BagTopic, wanted: str | None, voice: Voice) -> list[ScanIndex]:
+def index_scans(bag: Bag, topic: BagTopic, choice: str | None, voice: Voice) -> list[ScanIndex]:
     """Scans of each chosen LiDAR of `topic`, see `choose_lidars`, with increasing stamps.
 
     Only headers are read, unless stamps repeat. Raises InputError when none can be read, UsageError for a LiDAR that is not
@@ -159,11 +158,11 @@ def index_scans(bag: Bag, topic: BagTopic, wanted: str | None, voice: Voice) -> 
         way_out = "; where its index is wrong `rosbag reindex` mends it" if is_ros1 else ""
         raise InputError(f"{bag.path}: none of the {len(topic)} messages of {topic.name} can be read{way_out}")
     messages = np.array(list(begun), np.int64)
-    recorded = topic.stamps_ns[messages]
+    recording_ns = topic.stamps_ns[messages]
     headers = np.array([header.stamp_ns for header, _ in begun.values()], np.int64)
     frames, ids = [header.frame for header, _ in begun.values()], [number for _, number in begun.values()]
     names = name_lidars(frames, ids)
-    chosen = choose_lidars(topic, names, wanted, voice)
+    chosen = choose_lidars(topic, names, choice, voice)
     is_own = _no_copies(headers, lambda i: bag.message(topic, int(messages[i])), f"{topic.name}: scans", voice)
     indices = []
     for name, mine in chosen:
@@ -171,9 +170,9 @@ def index_scans(bag: Bag, topic: BagTopic, wanted: str | None, voice: Voice) -> 
         halves = find_halves(bag, topic, messages[mine], headers[mine], its, voice)
         own = mine & is_own & ~np.isin(messages, [k for others in halves.values() for k in others])
         what = f"{topic.name}: scans" if len(chosen) == 1 else f"{topic.name}: scans of {name}"
-        order, ordered = put_in_order(headers[own], recorded[own], what, voice)
+        order, ordered = put_in_order(headers[own], recording_ns[own], what, voice)
         if np.array_equal(ordered, headers[own][order]):
-            delay_s = float(np.median(recorded[own][order] - ordered)) * 1e-9
+            delay_s = float(np.median(recording_ns[own][order] - ordered)) * 1e-9
             voice.notes.append(
                 f"{what} have the stamps of their headers; they were recorded {delay_s:.3f} s after (median)"
             )
@@ -200,20 +199,20 @@ def _no_copies(stamps: Stamps, content: Callable[[int], bytes], what: str, voice
     return own
 
 
-def put_in_order(stamps: Stamps, recorded: Stamps, what: str, voice: Voice) -> tuple[Stamps, Stamps]:
+def put_in_order(stamps: Stamps, recording_ns: Stamps, what: str, voice: Voice) -> tuple[Stamps, Stamps]:
     """Messages that are kept, in order, and their increasing stamps; faults are added to the problems.
 
     Constant stamps are replaced by the times of recording, which also correct steps of the stamps (`clocks`). Messages that
     are a few places late are sorted in. Dropped are repeated stamps, and messages that go back further by both clocks or
     repeat a span of time.
     """
-    if stands_still(stamps, recorded):
+    if stands_still(stamps, recording_ns):
         still = f" that stand still at {seconds_text(int(stamps[0]))} s" if stamps.any() else ""
         fact = f"{'' if still else 'no '}stamps in their headers{still}"
         voice.problems.append(f"{what} have {fact}: the times of recording are used, late as they are")
-        stamps = recorded
+        stamps = recording_ns
     late, again = _lateness(stamps)
-    stamps = agree(stamps, np.where(again, 0, late), Clock("the times of recording", recorded), what, voice)
+    stamps = agree(stamps, np.where(again, 0, late), Clock("the times of recording", recording_ns), what, voice)
     late, again = _lateness(stamps)
     index = np.arange(len(stamps), dtype=np.int64)
     if again.any():
@@ -256,16 +255,16 @@ def _told_again(stamps: Stamps, late: Stamps, step: float) -> Bools:
     return again
 
 
-def _named(bag: Bag, topics: list[BagTopic], wanted: str, flag: str, what: str) -> BagTopic:
+def _find_topic(bag: Bag, topics: list[BagTopic], choice: str, flag: str, what: str) -> BagTopic:
     for own in topics:
-        if own.name.strip("/") == wanted.strip("/"):
+        if own.name.strip("/") == choice.strip("/"):
             return own
-    other = next((t for t in bag.topics if t.name.strip("/") == wanted.strip("/")), None)
+    other = next((t for t in bag.topics if t.name.strip("/") == choice.strip("/")), None)
     fact = (
         "is not there" if other is None else f"holds {len(other)} messages of type {other.type or 'unknown'}, no {what}"
     )
     way_out = f"choose one:\n{_flags(topics, flag)}" if topics else _listing(bag)
-    raise UsageError(f"{flag} {wanted}: the topic {fact} in {bag.path}; {way_out}")
+    raise UsageError(f"{flag} {choice}: the topic {fact} in {bag.path}; {way_out}")
 
 
 def _flags(topics: list[BagTopic], flag: str) -> str:

@@ -1,31 +1,41 @@
-"""Cameras of folders and of KITTI's layouts. Images are listed when cameras are asked for, and read one by one."""
+"""Cameras of folders, of KITTI's layouts and of bags. Images are listed when cameras are asked for, and read one by one."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from lslam.core.errors import InputError
 from lslam.core.geometry import se3
 from lslam.core.types.arrays import Floats, Longs
-from lslam.core.types.camera import Camera, Image
-from lslam.io.formats.calibration_files import read_projection, read_raw_cam0_lidar
-from lslam.io.formats.camera_info import CameraInfo
-from lslam.io.formats.image_files import SUFFIXES, image_size, read_image
-from lslam.io.formats.sequence_toml import FILE_NAME
+from lslam.core.types.camera import MODELS, Camera, Image, Lens
+from lslam.io.formats.bag_files import Bag, BagTopic, read_header
+from lslam.io.formats.image_files import SUFFIXES, decode_image, from_pixels, image_size, read_image
+from lslam.io.formats.kitti_layout import read_projection, read_raw_cam0_lidar
+from lslam.io.formats.sequence_toml import FILE_NAME, CameraInfo
 from lslam.io.formats.time_columns import read_stamps
+from lslam.io.readers.bag_lidars import Links
+from lslam.io.readers.bag_topics import HEADER, put_in_order
+from lslam.io.readers.ground_truth import Voice
 from lslam.io.readers.listing import list_scans, rows_of
+
+# ROS' words for the models of `Lens`; a rational polynomial with more coefficients than eight bends its sensor.
+_ROS_MODELS = {"plumb_bob": "pinhole", "rational_polynomial": "pinhole", "equidistant": "fisheye", "fisheye": "fisheye"}
+_PACKED = "/compressed"
+# Stamps of images and times of recording to the offset of their clock from that of the scans, ns.
+Ahead = Callable[[Longs, Longs, str], int]
 
 
 def folder_cameras(folder: Path, infos: Mapping[str, CameraInfo]) -> list[Camera]:
     """Cameras that `sequence.toml` names. Raises InputError where images or stamps are missing, or their numbers differ."""
-    return [_camera_of(folder, name, info) for name, info in infos.items()]
+    return [_folder_camera(folder, name, info) for name, info in infos.items()]
 
 
-def _camera_of(folder: Path, name: str, info: CameraInfo) -> Camera:
+def _folder_camera(folder: Path, name: str, info: CameraInfo) -> Camera:
     files = _images(folder / info.images, f"named by cameras.{name} of {folder / FILE_NAME}")
     path = folder / info.stamps_file
     if not path.is_file():
@@ -34,17 +44,17 @@ def _camera_of(folder: Path, name: str, info: CameraInfo) -> Camera:
     if len(stamps) != len(files):
         raise InputError(f"{path} has {len(stamps)} stamps for {len(files)} images of camera {name}")
     stamps = stamps + round(1e9 * info.time_offset_s)
-    return stamped(name, info, files, stamps, path)
+    return camera_of_files(name, info, files, stamps, path)
 
 
-def stamped(name: str, info: CameraInfo, files: list[Path], stamps: Longs, source: Path) -> Camera:
+def camera_of_files(name: str, info: CameraInfo, files: list[Path], stamps: Longs, source: Path) -> Camera:
     """Camera of image files and their stamps. Raises InputError when time goes back."""
     back = np.flatnonzero(np.diff(stamps) <= 0)
     if len(back):
         raise InputError(
             f"{source}: time does not increase at line {back[0] + 2}: camera {name} needs increasing stamps"
         )
-    return Camera(name, info.lens(image_size(files[0])), info.T_lidar_camera, stamps, partial(_read, files))
+    return Camera(name, info.lens(image_size(files[0])), info.T_lidar_camera, stamps, partial(_read_file, files))
 
 
 def kitti_cameras(folder: Path, scans: list[Path], stamps_ns: Longs, T_cam0_lidar: Floats | None) -> list[Camera]:
@@ -56,7 +66,7 @@ def kitti_cameras(folder: Path, scans: list[Path], stamps_ns: Longs, T_cam0_lida
         raise InputError(f"the camera of {folder} has no calibration: {folder / 'calib.txt'} with P2 and Tr is missing")
     files = _images(place, "of KITTI's layout")
     stamps = _stamps_by_name(files, scans, stamps_ns)
-    return [_rectified("image_2", folder / "calib.txt", "P2", T_cam0_lidar, files, stamps)]
+    return [_rectified_camera("image_2", folder / "calib.txt", "P2", T_cam0_lidar, files, stamps)]
 
 
 def kitti_raw_cameras(folder: Path) -> list[Camera]:
@@ -77,7 +87,7 @@ def kitti_raw_cameras(folder: Path) -> list[Camera]:
     rows, _ = rows_of(files, len(stamps))
     if not len(stamps) or (rows < 0).any():
         raise InputError(f"{place / 'timestamps.txt'} has {len(stamps)} stamps for {len(files)} images")
-    return [_rectified("image_02", day / "calib_cam_to_cam.txt", "P_rect_02", T_cam0_lidar, files, stamps[rows])]
+    return [_rectified_camera("image_02", day / "calib_cam_to_cam.txt", "P_rect_02", T_cam0_lidar, files, stamps[rows])]
 
 
 def _stamps_by_name(files: list[Path], scans: list[Path], stamps_ns: Longs) -> Longs:
@@ -89,13 +99,15 @@ def _stamps_by_name(files: list[Path], scans: list[Path], stamps_ns: Longs) -> L
     return np.array([known[path.stem] for path in files], np.int64)
 
 
-def _rectified(name: str, calib: Path, key: str, T_cam0_lidar: Floats, files: list[Path], stamps: Longs) -> Camera:
+def _rectified_camera(
+    name: str, calib: Path, key: str, T_cam0_lidar: Floats, files: list[Path], stamps: Longs
+) -> Camera:
     """Camera of rectified images by its projection P = K [1 | t] of points of the rectified camera 0."""
     P = read_projection(calib, key)
     T_camera_cam0 = se3.make(np.eye(3), np.linalg.solve(P[:, :3], P[:, 3]))
     T_lidar_camera = se3.inverse(T_camera_cam0 @ T_cam0_lidar)
     intrinsics = (float(P[0, 0]), float(P[1, 1]), float(P[0, 2]), float(P[1, 2]))
-    return stamped(name, CameraInfo(name, intrinsics, T_lidar_camera), files, stamps, calib)
+    return camera_of_files(name, CameraInfo(name, intrinsics, T_lidar_camera), files, stamps, calib)
 
 
 def _images(folder: Path, whose: str) -> list[Path]:
@@ -105,5 +117,112 @@ def _images(folder: Path, whose: str) -> list[Path]:
     return files
 
 
-def _read(files: list[Path], k: int) -> Image:
+def _read_file(files: list[Path], k: int) -> Image:
     return read_image(files[k])
+
+
+def bag_cameras(
+    bag: Bag, links: Links, lidar: str, ahead: Ahead, infos_in_toml: Mapping[str, CameraInfo] | None
+) -> list[Camera]:
+    """Cameras of a bag, by name of their topics; of a raw and a compressed topic of the same images the raw one.
+
+    links, lidar : transforms, and the frame of the scans; infos_in_toml : cameras of `sequence.toml`, whose `images` name a topic
+
+    A camera without a calibration is named in the problems. Raises InputError if none has one.
+    """
+    voice, cameras, faults = links.voice, [], []
+    named = {info.images: (name, info) for name, info in (infos_in_toml or {}).items()}
+    topics = {topic.name: topic for topic in bag.of_type("Image", "CompressedImage")}
+    if unknown := [name for name in named if name not in topics]:
+        raise InputError(
+            f"{bag.path} has no images in {unknown[0]}, which cameras of sequence.toml names: {_list_topics(topics)}"
+        )
+    for topic in topics.values():
+        if topic.name.endswith(_PACKED) and topic.name.removesuffix(_PACKED) in topics:
+            continue
+        if named and topic.name not in named:
+            continue
+        try:
+            cameras.append(_bag_camera(bag, topic, links, lidar, ahead, named.get(topic.name)))
+        except InputError as error:
+            faults.append(str(error))
+    if faults and not cameras:
+        raise InputError("; ".join(faults))
+    voice.problems += [f"a camera is not used: {fault}" for fault in faults]
+    return cameras
+
+
+def _bag_camera(
+    bag: Bag, topic: BagTopic, links: Links, lidar: str, ahead: Ahead, infos_in_toml: tuple[str, CameraInfo] | None
+) -> Camera:
+    heads = [(k, head) for k, head in bag.each(topic, partial(read_header, topic), links.voice.problems, HEADER)]
+    if not heads:
+        raise InputError(f"{topic.name} has no image that can be read")
+    numbers = np.array([k for k, _ in heads], np.int64)
+    recording_ns = topic.stamps_ns[numbers]
+    voice = Voice([], links.voice.problems)
+    order, stamps = put_in_order(
+        np.array([h.stamp_ns for _, h in heads], np.int64), recording_ns, f"{topic.name}: images", voice
+    )
+    numbers = numbers[order]
+    stamps = stamps - ahead(stamps, topic.stamps_ns[numbers], topic.name)
+    read = partial(_read_message, bag, topic, numbers)
+    if infos_in_toml is not None:
+        name, info = infos_in_toml
+        height, width = read(0).shape[:2]
+        return Camera(
+            name, info.lens((width, height)), info.T_lidar_camera, stamps + round(1e9 * info.time_offset_s), read
+        )
+    lens = _bag_lens(bag, topic)
+    frame = heads[0][1].frame
+    place = links.find(lidar, frame)
+    if place is None:
+        raise InputError(f"camera {topic.name} has no place: {links.why_not(lidar, frame)}; {_state_in_toml(topic)}")
+    return Camera(topic.name, lens, place[0], stamps, read)
+
+
+def _bag_lens(bag: Bag, topic: BagTopic) -> Lens:
+    """The lens by the CameraInfo beside the images. Raises InputError where there is none, or one that is not filled in."""
+    image = topic.name.removesuffix(_PACKED)
+    beside = (f"{image.rpartition('/')[0]}/camera_info", f"{image}/camera_info")
+    infos = [t for t in bag.of_type("CameraInfo") if t.name in beside]
+    if not infos:
+        raise InputError(f"camera {topic.name} has no calibration: there is no {beside[0]}; {_state_in_toml(topic)}")
+    message = bag.decode(infos[0], bag.message(infos[0], 0))
+    # ROS 1 has capitals.
+    K, D, P = (np.asarray(getattr(message, name, getattr(message, name.lower(), ()))) for name in ("K", "D", "P"))
+    model = _ROS_MODELS.get(message.distortion_model or "plumb_bob", "")
+    is_rectified = "rect" in image.rpartition("/")[2]
+    coefficients = () if is_rectified else tuple(np.trim_zeros(np.asarray(D, np.float64), "b").tolist())
+    matrix: Floats = P.reshape(3, 4)[:, :3] if is_rectified else K.reshape(3, 3)
+    fx, fy, cx, cy = (float(matrix[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    if not (fx > 0 and fy > 0):
+        raise InputError(
+            f"camera {topic.name} has no calibration: {infos[0].name} is not filled in; {_state_in_toml(topic)}"
+        )
+    if not model or len(coefficients) > MODELS[model][-1]:
+        raise InputError(
+            f"camera {topic.name}: distortion {message.distortion_model} of {len(coefficients)} coefficients is not known: "
+            f"{', '.join(_ROS_MODELS)} are"
+        )
+    return Lens(
+        "pinhole" if is_rectified else model, (int(message.width), int(message.height)), (fx, fy, cx, cy), coefficients
+    )
+
+
+def _read_message(bag: Bag, topic: BagTopic, numbers: Longs, k: int) -> Image:
+    number = int(numbers[k])
+    source = f"{bag.path}, {topic.name}, message {number}"
+    message: Any = bag.decode(topic, bag.message(topic, number))
+    data = np.asarray(message.data, np.uint8)
+    if topic.type.endswith("CompressedImage"):
+        return decode_image(data.tobytes(), source)
+    return from_pixels(data, int(message.width), int(message.height), int(message.step), message.encoding, source)
+
+
+def _state_in_toml(topic: BagTopic) -> str:
+    return f'write [cameras.NAME] with images = "{topic.name}" in sequence.toml beside the bag'
+
+
+def _list_topics(topics: Mapping[str, BagTopic]) -> str:
+    return f"it has {', '.join(topics)}" if topics else "it has none"

@@ -75,7 +75,7 @@ def agree(headers: Stamps, late_ns: Stamps, witness: Clock, what: str, voice: Vo
         )
         return headers
     steps, jumps = np.diff(h), np.diff(w)
-    spread = _recording_spread(w, period)
+    spread = _delay_range(w, period)
     limit = max(0.5 * period + float(late_ns.max()), spread)
     is_apart = np.abs(steps - jumps) > limit
     is_odd = np.abs(steps - period) > 0.5 * period
@@ -90,9 +90,9 @@ def agree(headers: Stamps, late_ns: Stamps, witness: Clock, what: str, voice: Vo
     edges, sizes = edges[sizes != 0], sizes[sizes != 0]
     if not len(edges):
         return headers
-    repaired = steps.copy()
-    repaired[edges] = _intervals(steps[edges] - sizes, steps, period)
-    since_first = np.concatenate([[0], np.cumsum(repaired)])
+    new_steps = steps.copy()
+    new_steps[edges] = _intervals(steps[edges] - sizes, steps, period)
+    since_first = np.concatenate([[0], np.cumsum(new_steps)])
     offset = _offsets(h - h[0] - since_first, h - w, limit)
     first = int(edges[0])
     places = f" and at {len(edges) - 1} more" if len(edges) > 1 else ""
@@ -104,16 +104,16 @@ def agree(headers: Stamps, late_ns: Stamps, witness: Clock, what: str, voice: Vo
     return headers - offset[np.maximum(np.searchsorted(keep, np.arange(len(headers)), "right") - 1, 0)]
 
 
-def follow(stamps: Stamps, scans: Stamps, repaired: Stamps, what: str, voice: Voice) -> Stamps:
-    """Stamps (N,) corrected like the scans, from `scans` to `repaired` (M,), if they step with these; else unchanged."""
-    interval = float(np.median(np.diff(repaired))) if len(scans) > 1 else 0.0
-    removed = np.diff(scans) - np.diff(repaired)
+def follow(stamps: Stamps, scans: Stamps, new_stamps: Stamps, what: str, voice: Voice) -> Stamps:
+    """Stamps (N,) corrected like the scans, from `scans` to `new_stamps` (M,), if they step with these; else unchanged."""
+    interval = float(np.median(np.diff(new_stamps))) if len(scans) > 1 else 0.0
+    removed = np.diff(scans) - np.diff(new_stamps)
     at = np.flatnonzero(np.abs(removed) > 0.5 * interval)
     if not len(at) or len(stamps) < 3:
         return stamps
     steps = np.diff(stamps)
     slack = 0.5 * interval + float(np.median(steps))
-    offset = np.full(len(stamps), scans[0] - repaired[0])
+    offset = np.full(len(stamps), scans[0] - new_stamps[0])
     last = -1
     for k, size in zip(at.tolist(), removed[at].tolist(), strict=True):
         is_alike = (np.abs(steps - size) < slack) & (np.abs(stamps[:-1] - scans[k]) < 2 * interval + slack)
@@ -126,28 +126,30 @@ def follow(stamps: Stamps, scans: Stamps, repaired: Stamps, what: str, voice: Vo
     return np.asarray(stamps - offset)
 
 
-def onto(stamps: Stamps, scans: Stamps, repaired: Stamps) -> Stamps:
-    """`repaired` (M,) on the one of the clocks of `scans` (M,) that overlaps most with another stream (N,)."""
+def onto(stamps: Stamps, scans: Stamps, new_stamps: Stamps) -> Stamps:
+    """`new_stamps` (M,) on the one of the clocks of `scans` (M,) that overlaps most with another stream (N,)."""
     shared = {
-        int(offset): np.count_nonzero((repaired + offset >= stamps.min()) & (repaired + offset <= stamps.max()))
-        for offset in [0, *np.unique(scans - repaired)[:_OFFSETS]]
+        int(offset): np.count_nonzero((new_stamps + offset >= stamps.min()) & (new_stamps + offset <= stamps.max()))
+        for offset in [0, *np.unique(scans - new_stamps)[:_OFFSETS]]
     }
-    best: Stamps = repaired + max(shared, key=lambda offset: (shared[offset], offset == 0))
+    best: Stamps = new_stamps + max(shared, key=lambda offset: (shared[offset], offset == 0))
     return best
 
 
-def ahead_of(own: Stamps, recorded: Stamps, stamps: Stamps, its_recorded: Stamps, what: str, voice: Voice) -> int:
+def ahead_of(
+    own: Stamps, recording_ns: Stamps, stamps: Stamps, its_recording_ns: Stamps, what: str, voice: Voice
+) -> int:
     """Offset of a stream's clock, `stamps` (N,), from that of the scans, `own` (M,), ns; 0 unless both measure the same time.
 
-    recorded, its_recorded : times of recording of each. The messages with the least delay determine the offset, unless the
-    times of recording run at another speed.
+    recording_ns, its_recording_ns : times of recording of each. The messages with the least delay determine the offset, unless
+    the times of recording run at another speed.
     """
-    for h, w in (own, recorded), (stamps, its_recorded):
+    for h, w in (own, recording_ns), (stamps, its_recording_ns):
         if len(h) < 2 or not _SLOWEST <= _period_and_speed(h, w)[1] <= _FASTEST:
             return 0
-    ahead = int((stamps - its_recorded).max() - (own - recorded).max())
+    ahead = int((stamps - its_recording_ns).max() - (own - recording_ns).max())
     is_apart = stamps[0] > own[-1] or stamps[-1] < own[0]
-    is_together = its_recorded.min() <= recorded.max() and its_recorded.max() >= recorded.min()
+    is_together = its_recording_ns.min() <= recording_ns.max() and its_recording_ns.max() >= recording_ns.min()
     if not is_together or abs(ahead) <= (_LATER_NS if is_apart else 10 * _LATER_NS):
         return 0
     voice.problems.append(
@@ -190,7 +192,7 @@ def _in_turns(h: Stamps, w: Stamps) -> bool:
         return False
     period, _ = _period_and_speed(h, w)
     is_irregular = np.abs(np.diff(np.sort(h)).astype(np.float64) - period) > _UNEVEN * period
-    return bool(np.mean(is_irregular) > _MANY and _recording_spread(w, period) < 0.5 * period)
+    return bool(np.mean(is_irregular) > _MANY and _delay_range(w, period) < 0.5 * period)
 
 
 def runs(mask: Bools) -> Longs:
@@ -204,7 +206,7 @@ def _set_back(h: Stamps, w: Stamps, late_ns: Stamps) -> Bools:
     if not late_ns.any():
         return back
     ahead, period = h - w, _period_and_speed(h, w)[0]
-    limit = max(0.5 * period, _recording_spread(w, period))
+    limit = max(0.5 * period, _delay_range(w, period))
     for begin, end in runs(late_ns > 0):
         before, after = ahead[max(begin - _LEVEL_SAMPLES, 0) : begin], ahead[end : end + _LEVEL_SAMPLES]
         own = ahead[begin:end].max()
@@ -219,7 +221,7 @@ def _in_parts(h: Stamps) -> bool:
     return 1 < usual < MESSAGES_PER_STAMP and bool(np.mean(counts == usual) > 1 - _MIN_SHARE)
 
 
-def _recording_spread(w: Stamps, period: float) -> float:
+def _delay_range(w: Stamps, period: float) -> float:
     """Spread of the recording delays of neighbouring messages, ns: messages often arrive in batches."""
     even = w - w[0] - np.arange(len(w)) * period
     spread = 0.0
@@ -262,8 +264,8 @@ def _intervals(across: NDArray[Any], steps: Stamps, period: float) -> Stamps:
     is_regular = np.median(np.abs(steps - np.float64(period))) < _REGULAR * period
     count = np.maximum(np.rint(across / period), 1)
     is_near = np.abs(across / period - count) < _SNAP
-    repaired = np.where(is_regular & is_near, np.rint(count * period), np.where(across > 0, across, period))
-    return repaired.astype(np.int64)
+    intervals = np.where(is_regular & is_near, np.rint(count * period), np.where(across > 0, across, period))
+    return intervals.astype(np.int64)
 
 
 def _offsets(offset: Stamps, ahead: Stamps, limit: float) -> Stamps:

@@ -20,7 +20,7 @@ from lslam.io.formats.kitti_layout import POS_ACC, ROLL, YAW, Oxts
 from lslam.io.formats.sequence_toml import FILE_NAME, SequenceInfo
 from lslam.io.formats.text_tables import read_table
 from lslam.io.formats.trajectory_files import read_trajectory
-from lslam.io.formats.trajectory_lines import fits_kitti, read_matrices, scans_of, without_lost
+from lslam.io.formats.trajectory_lines import drop_lost_poses, fits_kitti, read_matrices, scans_of
 from lslam.io.readers.listing import file_numbers, filled_stamps, rows_of
 from lslam.io.remote import RemotePath, as_path
 
@@ -72,7 +72,7 @@ def load_poses(path: Path, stamps_ns: Longs, files: list[Path], voice: Voice) ->
     """Poses of `path` in the frame of the file; rows without time get the stamps of the scans they belong to."""
     try:
         table = read_table(path)
-        truth = without_lost(read_matrices(table)) if fits_kitti(table.first) else read_trajectory(path)
+        truth = drop_lost_poses(read_matrices(table)) if fits_kitti(table.first) else read_trajectory(path)
         voice.notes += [f"ground truth {path}: {note}" for note in truth.notes]
         return truth if truth.has_stamps else _pair(truth, stamps_ns, files, voice)
     except InputError as error:
@@ -80,7 +80,7 @@ def load_poses(path: Path, stamps_ns: Longs, files: list[Path], voice: Voice) ->
         return None
 
 
-class Numbered(NamedTuple):
+class NumberedPoses(NamedTuple):
     """Scans and poses matched by number: truth of the scans that `have` (N,) a pose, and stamps_ns (N,) of all scans."""
 
     truth: Trajectory
@@ -88,7 +88,7 @@ class Numbered(NamedTuple):
     stamps_ns: Longs
 
 
-def pair_by_number(truth: Trajectory, files: list[Path]) -> Numbered | None:
+def pair_by_number(truth: Trajectory, files: list[Path]) -> NumberedPoses | None:
     """Poses of a CSV matched with scan files by its first column, `num` (MCD).
 
     Scans without a pose get their stamps from their numbers. The result is None when the file has no such column or fewer
@@ -102,12 +102,12 @@ def pair_by_number(truth: Trajectory, files: list[Path]) -> Numbered | None:
     row_of = {whole_number(row.cells[0]): k for k, row in enumerate(table.rows)}
     if len(table.rows) != len(truth) or None in row_of:
         return None
-    found = np.array([row_of.get(int(n), -1) for n in numbers_of_files])
-    have = found >= 0
-    known = found[have]
+    rows = np.array([row_of.get(int(n), -1) for n in numbers_of_files])
+    have = rows >= 0
+    known = rows[have]
     if len(known) < 2 or np.any(np.diff(known) <= 0) or (not have.all() and len(truth) == len(files)):
         return None
-    return Numbered(
+    return NumberedPoses(
         truth.select(known), have, filled_stamps(numbers_of_files, numbers_of_files[have], truth.stamps_ns[known])
     )
 

@@ -10,14 +10,14 @@ from lslam.core.printable import printable
 from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.sequence import Calibration
 from lslam.core.types.trajectory import Trajectory
-from lslam.io.formats.calibration_files import read_odometry_calib
+from lslam.io.formats.kitti_layout import read_odometry_calib
 from lslam.io.formats.point_records import KITTI
 from lslam.io.formats.sequence_toml import SequenceInfo
+from lslam.io.readers import sequence_number
 from lslam.io.readers.cameras import kitti_cameras
 from lslam.io.readers.folder_sequence import Folder, FolderSequence
 from lslam.io.readers.ground_truth import find_ground_truth, to_lidar
 from lslam.io.readers.listing import DEFAULT_RATE_HZ, list_scans, load_stamps, nominal_stamps
-from lslam.io.readers.lookup import sequence_number
 from lslam.io.readers.sidecars import calibration_over, vertical_correction
 
 KIND = "kitti-odometry"
@@ -32,12 +32,12 @@ def locate(folder: Path) -> tuple[Path, str] | None:
         return folder, "it has velodyne/, as KITTI odometry sequences do"
     for sequences in (folder / "sequences", folder / "dataset" / "sequences"):
         if sequences.is_dir():
-            found = sorted(p for p in sequences.iterdir() if (p / "velodyne").is_dir())
-            if len(found) == 1:
-                return found[0], f"{sequences} holds this single KITTI odometry sequence"
-            names = ", ".join(p.name for p in found)
-            if found:
-                raise InputError(f"{folder} holds {len(found)} sequences ({names}): name one, for example {found[0]}")
+            drives = sorted(p for p in sequences.iterdir() if (p / "velodyne").is_dir())
+            if len(drives) == 1:
+                return drives[0], f"{sequences} holds this single KITTI odometry sequence"
+            names = ", ".join(p.name for p in drives)
+            if drives:
+                raise InputError(f"{folder} holds {len(drives)} sequences ({names}): name one, for example {drives[0]}")
             raise InputError(f"{sequences} holds no sequence with a velodyne folder: fetch the velodyne data")
     return None
 

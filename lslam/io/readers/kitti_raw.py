@@ -26,18 +26,27 @@ from lslam.core.types.gnss import GnssStream
 from lslam.core.types.imu import ImuStream
 from lslam.core.types.sequence import Calibration, Sequence
 from lslam.core.types.trajectory import Trajectory
-from lslam.io.formats.calibration_files import read_raw_cam0_lidar, read_rigid
-from lslam.io.formats.kitti_layout import ACCEL, GYRO, POS_ACC, ROLL, YAW, Oxts, read_oxts
+from lslam.io.formats.kitti_layout import (
+    ACCEL,
+    GYRO,
+    POS_ACC,
+    ROLL,
+    YAW,
+    Oxts,
+    read_oxts,
+    read_raw_cam0_lidar,
+    read_rigid,
+)
 from lslam.io.formats.point_files import SUFFIXES
 from lslam.io.formats.sequence_toml import SequenceInfo
 from lslam.io.formats.time_columns import read_stamps
+from lslam.io.readers import DRIVE, sequence_number
 from lslam.io.readers.bag_topics import GNSS, IMU, Companion, why_none
 from lslam.io.readers.cameras import kitti_raw_cameras
 from lslam.io.readers.folder_sequence import Folder, FolderSequence
 from lslam.io.readers.ground_truth import find_ground_truth, oxts_truth, to_lidar
 from lslam.io.readers.kitti_odometry import KIND as KITTI_ODOMETRY
 from lslam.io.readers.listing import DEFAULT_RATE_HZ, list_scans, load_stamps, nominal_stamps, rows_of
-from lslam.io.readers.lookup import DRIVE, sequence_number
 from lslam.io.readers.sidecars import calibration_over, load_streams, vertical_correction
 
 KIND = "kitti-raw"
@@ -267,7 +276,7 @@ def with_imu(sequence: Sequence, data_root: Path | None = None) -> Sequence:
     """
     if sequence.imu is not None:
         return sequence
-    if not hasattr(sequence, "bag") and not _is_cut(sequence):
+    if not hasattr(sequence, "bag") and not _is_drive_part(sequence):
         if isinstance(sequence, FolderSequence):
             raise InputError(
                 f"{sequence.path} has no IMU: looked for {sequence.path / 'imu.csv'} and `imu` in sequence.toml there; "
@@ -284,12 +293,12 @@ def with_gnss(sequence: Sequence, data_root: Path | None = None) -> Sequence:
 
     Other folders come back as they are. Raises as `with_imu`.
     """
-    if sequence.gnss is not None or not (hasattr(sequence, "bag") or _is_cut(sequence)):
+    if sequence.gnss is not None or not (hasattr(sequence, "bag") or _is_drive_part(sequence)):
         return sequence
     return _with_oxts(sequence, data_root, GNSS, "satellite fixes", "gnss.csv")
 
 
-def _is_cut(sequence: Sequence) -> bool:
+def _is_drive_part(sequence: Sequence) -> bool:
     """Whether a sequence is known to be a part of a raw drive."""
     is_kitti = isinstance(sequence, FolderSequence) and sequence.kind == KITTI_ODOMETRY
     return is_kitti and sequence_number(sequence.path.name) in DRIVES

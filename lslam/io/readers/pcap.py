@@ -14,12 +14,12 @@ from lslam.core.types.scan import Scan
 from lslam.core.types.sequence import Calibration
 from lslam.io.formats import velodyne_packets
 from lslam.io.formats.bag_listing import CAPTURES
-from lslam.io.formats.packet_messages import maker_by_bytes, not_decoded
 from lslam.io.formats.pcap_files import Datagrams, read_datagrams
+from lslam.io.formats.sensor_messages import decoding_advice, maker_by_bytes
 from lslam.io.formats.sequence_toml import SequenceInfo
 from lslam.io.readers.ground_truth import Voice
 from lslam.io.readers.listing import list_scans
-from lslam.io.readers.pcap_revolutions import Opened, Revolutions, open_ouster, open_velodyne, read_scan
+from lslam.io.readers.pcap_revolutions import Revolutions, SpinningSensor, open_ouster, open_velodyne, read_scan
 from lslam.io.readers.sequence_on_disk import SequenceOnDisk
 from lslam.io.readers.sidecars import calibration_over, compensation_note, load_streams, read_info, stated_times
 
@@ -49,12 +49,14 @@ def locate(path: Path) -> tuple[Path, str] | None:
         return (path, f"{path.name} is a capture") if path.is_file() else None
     if not path.is_dir():
         return None
-    found = sorted(p for p in path.iterdir() if p.suffix.lower() in CAPTURES and p.is_file() and p.name[0] != ".")
-    if not found or list_scans(path)[0]:
+    captures = sorted(p for p in path.iterdir() if p.suffix.lower() in CAPTURES and p.is_file() and p.name[0] != ".")
+    if not captures or list_scans(path)[0]:
         return None
-    if len(found) > 1:
-        raise InputError(f"{path} holds {len(found)} captures ({', '.join(p.name for p in found)}): name one of them")
-    return found[0], f"it holds the capture {found[0].name}"
+    if len(captures) > 1:
+        raise InputError(
+            f"{path} holds {len(captures)} captures ({', '.join(p.name for p in captures)}): name one of them"
+        )
+    return captures[0], f"it holds the capture {captures[0].name}"
 
 
 def open_folder(path: Path, overrides: SequenceInfo, why: str) -> PcapSequence:
@@ -67,25 +69,25 @@ def open_folder(path: Path, overrides: SequenceInfo, why: str) -> PcapSequence:
     datagrams = read_datagrams(path)
     if datagrams.loss:
         voice.problems.append(datagrams.loss)
-    opened = _opener(path, datagrams)(path, datagrams, voice)
-    revolutions = opened.revolutions
+    spinning = _opener(path, datagrams)(path, datagrams, voice)
+    revolutions = spinning.revolutions
     sequence = PcapSequence(
         name=info.name or printable(path.stem),
         path=path,
         kind=KIND,
         revolutions=revolutions,
         stamps_ns=revolutions.stamps_ns,
-        rate_hz=info.rate_hz or opened.rate_hz,
-        rings=info.rings or opened.rings,
-        sensor=info.sensor or opened.sensor,
+        rate_hz=info.rate_hz or spinning.rate_hz,
+        rings=info.rings or spinning.rings,
+        sensor=info.sensor or spinning.sensor,
         motion_compensated=bool(info.motion_compensated),
         notes=voice.notes,
         problems=voice.problems,
         stated_times=stated_times(info),
-        calibration=calibration_over(info, Calibration(T_lidar_imu=opened.T_lidar_imu)),
+        calibration=calibration_over(info, Calibration(T_lidar_imu=spinning.T_lidar_imu)),
     )
     beside, sequence.gnss = load_streams(path.parent, info, voice)
-    sequence.imu = opened.imu if beside is None else beside
+    sequence.imu = spinning.imu if beside is None else beside
     if beside is not None and info.T_lidar_imu is None:
         voice.problems.append(
             "extrinsics: nothing says where the IMU beside the capture sits: it is taken to sit in the LiDAR, axes alike; "
@@ -97,7 +99,7 @@ def open_folder(path: Path, overrides: SequenceInfo, why: str) -> PcapSequence:
     return sequence
 
 
-def _opener(path: Path, datagrams: Datagrams) -> Callable[..., Opened]:
+def _opener(path: Path, datagrams: Datagrams) -> Callable[..., SpinningSensor]:
     """Function that opens the packets, by their size: Velodyne's all have 1206 bytes and a flag, Ouster's need metadata."""
     of_size = np.flatnonzero(datagrams.sizes == velodyne_packets.SIZE)
     flags = datagrams.bytes_at(of_size, (0, 1))
@@ -109,5 +111,5 @@ def _opener(path: Path, datagrams: Datagrams) -> Callable[..., Opened]:
     heads = datagrams.bytes_at(large, tuple(range(4)))
     makers = {maker_by_bytes(bytes(head), int(size)) for head, size in zip(heads, datagrams.sizes[large], strict=True)}
     if len(makers) == 1 and (maker := makers.pop()):
-        raise InputError(f"{path} holds {not_decoded(maker)}")
+        raise InputError(f"{path} holds {decoding_advice(maker)}")
     return open_ouster

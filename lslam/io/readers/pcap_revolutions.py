@@ -79,7 +79,7 @@ class Revolutions(Protocol):
 
 
 @dataclass(frozen=True)
-class Opened:
+class SpinningSensor:
     """Revolutions and facts about their sensor; `uses` : purpose of further topics of a bag."""
 
     revolutions: Revolutions
@@ -91,11 +91,11 @@ class Opened:
     uses: Mapping[str, str] = field(default_factory=dict)
 
 
-def read_scan(revolutions: Revolutions, index: int, is_timed: bool) -> Scan:
+def read_scan(revolutions: Revolutions, index: int, with_times: bool) -> Scan:
     """Revolution `index` as a scan, with the times of its points if they are to be used."""
     cloud, times_ns = revolutions.read(index)
     stamp = int(revolutions.stamps_ns[index])
-    times = ((times_ns - stamp) * 1e-9).astype(np.float32) if is_timed else None
+    times = ((times_ns - stamp) * 1e-9).astype(np.float32) if with_times else None
     return Scan(cloud.points, stamp, index, cloud.intensity, times, cloud.rings)
 
 
@@ -190,7 +190,7 @@ class VelodyneRevolutions:
         return split_blocks(packets, self.azimuth[begin:end], self.times_ns[begin:end], self.model)
 
 
-def open_velodyne(path: Path, datagrams: Packets, voice: Voice) -> Opened:
+def open_velodyne(path: Path, datagrams: Packets, voice: Voice) -> SpinningSensor:
     """Open the packets of a Velodyne sensor. Raises InputError for an unknown model, and for less than one revolution."""
     which = np.flatnonzero(datagrams.sizes == SIZE)
     which = which[(datagrams.bytes_at(which, (0, 1)) == FLAG).all(axis=1)]
@@ -222,7 +222,7 @@ def open_velodyne(path: Path, datagrams: Packets, voice: Voice) -> Opened:
         f"{len(which)} packets of a {model.name}, {RETURNS[mode]} return{' read: the last' if mode == DUAL else ''}; scans are "
         f"cut at the azimuth of {angle[0] * 0.01:.2f} deg"
     )
-    return Opened(revolutions, round(rate * 1e9 / TURN, 3), model.lasers, model.name)
+    return SpinningSensor(revolutions, round(rate * 1e9 / TURN, 3), model.lasers, model.name)
 
 
 def _factory(path: Path, datagrams: Packets, which: Longs) -> tuple[VelodyneModel, int]:
@@ -291,7 +291,7 @@ class OusterRevolutions:
         return cloud, times + self.shift_ns
 
 
-def open_ouster(path: Path, datagrams: Packets, voice: Voice) -> Opened:
+def open_ouster(path: Path, datagrams: Packets, voice: Voice) -> SpinningSensor:
     """Open the packets of an Ouster sensor. Raises InputError without metadata, or when no packet fits them."""
     beside = metadata_beside(path)
     if len(beside) != 1:
@@ -303,7 +303,9 @@ def open_ouster(path: Path, datagrams: Packets, voice: Voice) -> Opened:
     return open_with_metadata(path, datagrams, read_metadata(beside[0]), beside[0].name, voice)
 
 
-def open_with_metadata(path: Path, datagrams: Packets, sensor: OusterSensor, metadata: str, voice: Voice) -> Opened:
+def open_with_metadata(
+    path: Path, datagrams: Packets, sensor: OusterSensor, metadata: str, voice: Voice
+) -> SpinningSensor:
     """As `open_ouster`, with metadata already read; `metadata` names their source."""
     which = np.flatnonzero(datagrams.sizes == sensor.packet_bytes)
     if not len(which):
@@ -326,7 +328,7 @@ def open_with_metadata(path: Path, datagrams: Packets, sensor: OusterSensor, met
     revolutions = OusterRevolutions(datagrams, sensor, which, first, count, times[first] + shift, shift)
     imu = _imu(datagrams, shift, voice)
     T_lidar_imu = None if imu is None else se3.normalise(sensor.T_sensor_imu)
-    return Opened(revolutions, sensor.rate_hz, sensor.beams, sensor.name, imu, T_lidar_imu)
+    return SpinningSensor(revolutions, sensor.rate_hz, sensor.beams, sensor.name, imu, T_lidar_imu)
 
 
 def _shift(times_ns: Longs, captured_ns: Longs, voice: Voice) -> int:

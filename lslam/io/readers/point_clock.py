@@ -42,7 +42,7 @@ _SLOW_HZ = 1.0  # tried where no rate is stated and no sweep is as short as usua
 class TimedCloud(NamedTuple):
     """Points of a scan with times, (N,) float32 s or None; ns to add to the stamp; and a fault in words, empty if none.
 
-    unmeasured : number of points without coordinates whose times lie outside the sweep; they stay, with times at its
+    non_returns : number of points without coordinates whose times lie outside the sweep; they stay, with times at its
     beginning
     """
 
@@ -50,7 +50,7 @@ class TimedCloud(NamedTuple):
     times: NDArray[np.float32] | None
     shift_ns: int
     fault: str = ""
-    unmeasured: int = 0
+    non_returns: int = 0
 
 
 @dataclass(frozen=True)
@@ -66,17 +66,17 @@ class PointClock:
 
         Measured points with an impossible time are left out. Points that were not measured stay, since no method uses them.
         """
-        timed = self._timed(cloud, stamp_ns)
+        timed = self._read_times(cloud, stamp_ns)
         # Another clock or only nominal stamps: the sequence's own stamps stay.
         is_other = self.rule.is_absolute and abs(timed.shift_ns) >= _OTHER_CLOCK_NS
         return timed._replace(shift_ns=0) if is_other else timed
 
     def begin_ns(self, cloud: PointCloud) -> int | None:
         """Time of the first point, ns, from absolute times; None for a scan that breaks the rule."""
-        times, begin = replace(self, is_of_one_scan=True)._timed(cloud, 0)[1:3]
+        times, begin = replace(self, is_of_one_scan=True)._read_times(cloud, 0)[1:3]
         return None if times is None or not len(times) else begin
 
-    def _timed(self, cloud: PointCloud, stamp_ns: int) -> TimedCloud:
+    def _read_times(self, cloud: PointCloud, stamp_ns: int) -> TimedCloud:
         rule = self.rule
         if not len(cloud):
             return TimedCloud(cloud, np.zeros(0, np.float32), 0)  # an empty scan is no scan of a sensor without times
@@ -120,10 +120,10 @@ class PointClock:
             faults.append("the clock of the points was set within the sweep and is read on as before")
         if count:
             faults.append(f"{count} of {len(cloud)} points have times outside the sweep and are left out")
-        unmeasured = len(cloud) - int(np.count_nonzero(good | wrong))
+        non_returns = len(cloud) - int(np.count_nonzero(good | wrong))
         if count:
             cloud, times = cloud.select(~wrong), times[~wrong]
-        return TimedCloud(cloud, times, shift, "; ".join(faults), unmeasured)
+        return TimedCloud(cloud, times, shift, "; ".join(faults), non_returns)
 
     def _is_sound(self, values: NDArray[Any], count: int) -> bool:
         """Whether all times of a scan of `count` points can belong to one sweep; False if one of them is NaN."""
@@ -155,7 +155,7 @@ def read_samples(count: int, read: Callable[[int], Sample]) -> dict[int, Sample]
     first = range(min(count, 2 * _FIRST))
     others = [k for k in dict.fromkeys((count // 2, count - 1)) if k not in first]
     some = chain(islice(readable(first, read), _FIRST), readable(others, read))
-    return {index: sample.thinned(_ENOUGH) for index, sample in some}
+    return {index: sample.thin(_ENOUGH) for index, sample in some}
 
 
 def open_clock(
@@ -171,10 +171,10 @@ def open_clock(
     clock = None if rule is None else PointClock(rule, rate_hz)
     if clock is not None:
         notes.append(clock.rule.sentence)
-        unmeasured = max(clock.read(s.cloud, s.stamp_ns).unmeasured / len(s.cloud) for s in samples)
-        if unmeasured:
+        non_returns = max(clock.read(s.cloud, s.stamp_ns).non_returns / len(s.cloud) for s in samples)
+        if non_returns:
             notes.append(
-                f"up to {unmeasured:.1%} of the points of a scan are no returns (zeros or NaN) with times outside the sweep, "
+                f"up to {non_returns:.1%} of the points of a scan are no returns (zeros or NaN) with times outside the sweep, "
                 "which are not looked at"
             )
     read = [] if rule is None else rule.field.removesuffix(")").split(" (")[0].split(" + ")
@@ -286,12 +286,12 @@ def _clock(scans: Sequence[T], read: Callable[[T], PointCloud], rate_hz: float |
     return None
 
 
-def onto_recording(points: PointStamps, recorded: Stamps) -> tuple[Stamps, str]:
+def onto_recording(points: PointStamps, recording_ns: Stamps) -> tuple[Stamps, str]:
     """Stamps (N,) by the points, shifted to the clock of the recording if their epoch differs, and a sentence about it.
 
     The scan recorded with the least delay determines the offset.
     """
-    ahead = int((points.stamps_ns - recorded).max())
+    ahead = int((points.stamps_ns - recording_ns).max())
     note = f"scan stamps from the absolute times of the points, field {points.field!r}"
     if abs(ahead) <= _OTHER_EPOCH_NS:
         return points.stamps_ns, note

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from lslam.core.errors import InputError
 from lslam.core.types.arrays import Bools
 from lslam.core.types.scan import Span, has_return
-from lslam.io.formats.point_cloud import UNITS, PointCloud, TimeColumn
+from lslam.io.formats.point_cloud import PointCloud, TimeColumn
+from lslam.io.formats.time_columns import UNITS
 
 # A field's unit is that in which the scan lasts so many of its periods; an offset that begins later is a clock's reading.
 _SHORTEST, _LONGEST = 0.05, 3.0
@@ -60,7 +61,7 @@ class Sample:
     def __len__(self) -> int:
         return len(self.cloud)
 
-    def thinned(self, most: int) -> Sample:
+    def thin(self, most: int) -> Sample:
         """The same with `most` points, or a few more where it has fewer than twice as many."""
         step = max(len(self) // most, 1)
         return Sample(self.cloud.select(np.arange(0, len(self), step)), self.stamp_ns, step)
@@ -149,7 +150,7 @@ def _read(clock: TimeColumn, sample: Sample, rate_hz: float, unit: str | None, r
     def can_be(u: str) -> bool:
         low, high = limits[u]
         is_sweep = _SHORTEST <= (high - low) * UNITS[u] / period_ns <= _LONGEST
-        return is_sweep and (not clock.is_doubtful or (u == clock.unit and _is_swept(points, values, low, high)))
+        return is_sweep and (not clock.is_doubtful or (u == clock.unit and _is_sweep(points, values, low, high)))
 
     limits = {u: _limits(values, _LONGEST * period_ns / ns) for u, ns in UNITS.items()}
     fitting = [u for u in limits if can_be(u)]
@@ -199,7 +200,7 @@ def densest(values: NDArray[Any], among: Bools, width: float) -> Bools:
     return np.asarray(among & (values >= ordered[k]) & (values <= ordered[k + int(counts[k]) - 1]))
 
 
-def _is_swept(points: NDArray[np.float32], values: NDArray[Any], low: float, high: float) -> bool:
+def _is_sweep(points: NDArray[np.float32], values: NDArray[Any], low: float, high: float) -> bool:
     """Whether values (N,) from `low` to `high` look like times: they cover the sweep, and neighbouring points are alike."""
     shares = np.histogram(values.astype(np.float64), _PARTS, (low, high))[0] / max(len(values), 1)
     around = np.argsort(np.arctan2(points[:, 1], points[:, 0]), kind="stable")

@@ -13,12 +13,12 @@ from lslam.core.types.gnss import GnssStream
 from lslam.core.types.imu import ImuStream
 from lslam.core.types.sequence import Calibration
 from lslam.core.types.trajectory import Trajectory
-from lslam.io.formats.calibration_files import read_mcd_extrinsics, read_odometry_calib
+from lslam.io.formats.kitti_layout import read_mcd_extrinsics, read_odometry_calib
 from lslam.io.formats.point_files import SUFFIXES
 from lslam.io.formats.sequence_toml import SequenceInfo
 from lslam.io.readers.clocks import follow
 from lslam.io.readers.folder_sequence import Folder, FolderSequence
-from lslam.io.readers.ground_truth import Numbered, find_ground_truth, pair_by_number, to_lidar
+from lslam.io.readers.ground_truth import NumberedPoses, find_ground_truth, pair_by_number, to_lidar
 from lslam.io.readers.listing import DEFAULT_RATE_HZ, check_stamps, list_scans, nominal_stamps
 from lslam.io.readers.scan_stamps import StampedScans, stamp_scans
 from lslam.io.readers.sidecars import calibration_over, load_streams
@@ -96,7 +96,7 @@ def _stamps_and_truth(
     if path is not None and truth is not None and not np.isin(truth.stamps_ns, nominal).all():
         numbered, rule = pair_by_number(truth, files), "by its number column"
         if numbered is None and len(truth) == len(files):
-            numbered, rule = Numbered(truth, np.ones(len(files), np.bool_), truth.stamps_ns), "by index"
+            numbered, rule = NumberedPoses(truth, np.ones(len(files), np.bool_), truth.stamps_ns), "by index"
         if numbered is not None:
             voice.notes.append(f"no stamps of the scans: each takes the stamp of its row of {path.name}, {rule}")
             without = np.flatnonzero(~numbered.have)

@@ -5,20 +5,23 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from math import inf, isnan, log, nan
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 
+from lslam.core.errors import InputError
 from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.camera import Camera
 from lslam.core.types.gnss import GnssStream
 from lslam.core.types.imu import ImuStream
 from lslam.core.types.scan import Scan
-from lslam.core.types.sequence import Calibration, Scans, StatedTimes, no_shared_time, readable
+from lslam.core.types.sequence import Calibration, Scans, Sequence, SequenceView, StatedTimes, no_shared_time, readable
 from lslam.core.types.trajectory import Trajectory
-from lslam.io.formats.point_cloud import PointCloud
+from lslam.io.formats.point_cloud import LABEL_NAMES, PointCloud
+from lslam.io.formats.point_files import LABELS, read_labels
 from lslam.io.formats.sequence_toml import LENGTHS
 from lslam.io.readers.point_clock import PointClock
 from lslam.io.readers.point_times import TimeRule
@@ -35,6 +38,8 @@ _PATCHES, _PATCH_POINTS, _MOST_POINTS = 200, 12, 60_000
 _COARSEST_M, _THINNEST_M, _THICKEST_M = 0.1, 0.002, 0.3
 
 T = TypeVar("T", bound="SequenceOnDisk")
+# Scans of which one has labels, or the recording has none: the first that can be read.
+_LOOKED_AT = 5
 
 
 @dataclass(kw_only=True)
@@ -193,3 +198,46 @@ def _step(points: Floats) -> float:
         if np.abs(points / step - np.round(points / step)).max() < 1e-3:
             return step
     return 0.0
+
+
+class LabelledSequence(SequenceView):
+    """Sequence whose scans get labels from files where their points have none; all else is unchanged."""
+
+    def __init__(self, whole: Sequence, folder: Path, scans: list[Path]) -> None:
+        super().__init__(whole, notes=[*whole.notes, f"labels of points from {folder}"])
+        self._files = [folder / f"{scan.stem}.label" for scan in scans]
+
+    def scan(self, index: int) -> Scan:
+        """Read scan `index` and its labels.
+
+        Labels that are missing or do not match are reported. Raises InputError as the sequence does.
+        """
+        scan = self.whole.scan(index)
+        if scan.labels is not None or not len(scan):
+            return scan
+        try:
+            return replace(scan, labels=read_labels(self._files[index], len(scan)))
+        except InputError as error:
+            return replace(scan, fault="; ".join(filter(None, (scan.fault, str(error)))))
+
+
+def add_labels(sequence: Sequence) -> Sequence:
+    """Sequence with point labels from files beside its scans, if there are any."""
+    files: list[Path] = getattr(sequence, "files", [])
+    folder = sequence.path / LABELS
+    # Where LiDARs are merged, or some scans chosen, the files are of other scans.
+    is_whole = len(files) == len(sequence) and not hasattr(sequence, "further_lidars")
+    return LabelledSequence(sequence, folder, files) if is_whole and folder.is_dir() else sequence
+
+
+def with_labels(sequence: Sequence, key: str) -> Sequence:
+    """Sequence with point labels. Raises InputError where it has none, naming the `key` that needs them."""
+    whole = add_labels(sequence)
+    scans = [scan for _, scan in islice(readable(range(len(whole)), whole.scan), _LOOKED_AT)]
+    if scans and all(scan.labels is None for scan in scans):
+        why = f" ({scans[0].fault})" if whole is not sequence else ""
+        raise InputError(
+            f"{sequence.path}: {key} needs labels of points, and its first scans have none{why}; they are read from "
+            f"{LABELS}/*.label beside the scans and from fields {', '.join(LABEL_NAMES[:3])} and the like"
+        )
+    return whole

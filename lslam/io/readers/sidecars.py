@@ -95,10 +95,10 @@ def load_streams(folder: Path, info: SequenceInfo, voice: Voice) -> tuple[ImuStr
     return imu, _load(folder, info.gnss, "gnss.csv", read_gnss_csv, voice)
 
 
-def calibration_over(info: SequenceInfo, found: Calibration) -> Calibration:
+def calibration_over(info: SequenceInfo, calibration: Calibration) -> Calibration:
     """Extrinsics that `sequence.toml` states, else those of the reader."""
     stated = {name: T for name in EXTRINSICS if (T := getattr(info, name)) is not None}
-    return replace(found, frames={**found.frames, **(info.frames or {})}, **stated)
+    return replace(calibration, frames={**calibration.frames, **(info.frames or {})}, **stated)
 
 
 def per_point_folder(folder: Path, info: SequenceInfo) -> Path | None:
@@ -111,10 +111,12 @@ def per_point_folder(folder: Path, info: SequenceInfo) -> Path | None:
     return path
 
 
-def _load(folder: Path, named: str | None, usual: str, read: Callable[[Path, list[str]], T], voice: Voice) -> T | None:
-    path = folder / (named or usual)
+def _load(
+    folder: Path, stated_name: str | None, usual: str, read: Callable[[Path, list[str]], T], voice: Voice
+) -> T | None:
+    path = folder / (stated_name or usual)
     if not path.is_file():
-        if named is not None:
+        if stated_name is not None:
             voice.problems.append(f"{path}, named by {FILE_NAME}, does not exist")
         return None
     try:

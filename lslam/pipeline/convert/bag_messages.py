@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from lslam.core.geometry import so3
 from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.scan import Scan
-from lslam.io.formats.pointcloud2 import TYPES
+from lslam.io.formats.sensor_messages import TYPES
 
 _CODES = {np.dtype(name): code for code, name in TYPES.items()}  # of sensor_msgs/PointField
 _UNKNOWN = np.r_[-1.0, np.zeros(8)]  # sensor_msgs/Imu: a first covariance of -1 means that there is no such reading

@@ -22,8 +22,8 @@ from lslam.io.formats.bag_files import INFO_TOPIC
 from lslam.io.formats.kitti_layout import PER_POINT, POINTS, in_camera, write_calib, write_scan, write_times
 from lslam.io.formats.sequence_toml import FILE_NAME, FRAMES, SequenceInfo, sequence_toml_text, write_sequence_toml
 from lslam.io.formats.stamped_csv import write_gnss_csv, write_imu_csv
-from lslam.io.formats.trajectory_files import write_kitti, write_tum
-from lslam.io.readers.labels import labelled
+from lslam.io.formats.trajectory_lines import write_kitti, write_tum
+from lslam.io.readers.sequence_on_disk import add_labels
 from lslam.odometry.frontend.register_scans import sweep_of
 from lslam.odometry.inertial.constant_velocity import Course
 from lslam.pipeline.convert import bag_messages, check_beside, check_output, staged
@@ -74,7 +74,7 @@ def convert_sequence(
     OutputExistsError, OutputError : as named. UsageError : `out` or `lidars` does not suit. InputError : no scan can be read.
     """
     check_output(kind, out, is_zstd, overwrite)
-    source = _Source(labelled(sequence), trajectory, on_scan)
+    source = _Source(add_labels(sequence), trajectory, on_scan)
     if lidars != "merged":
         if kind == "kitti" or trajectory is not None or not isinstance(sequence, MergedLidars):
             raise UsageError(
@@ -252,7 +252,7 @@ def _write_kitti(source: _Source, out: Path) -> None:
         inside.mkdir(parents=True)
     stamps = []
     for number, scan in enumerate(source.scans()):
-        write_scan(folder, number, scan.points, scan.intensity, scan.times, scan.rings, scan.labels)
+        write_scan(folder, number, scan)
         stamps.append(scan.stamp_ns)
     _write_sides(source, folder, out / "poses", np.array(stamps, np.int64))
 

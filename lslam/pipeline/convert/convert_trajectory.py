@@ -22,7 +22,7 @@ from lslam.io.formats.atomic import write_text
 from lslam.io.formats.sequence_toml import FRAMES
 from lslam.io.formats.text_tables import utc_of
 from lslam.io.formats.trajectory_csv import write_csv
-from lslam.io.formats.trajectory_formats import FORMATS
+from lslam.io.formats.trajectory_files import FORMATS
 from lslam.maps.georeference import Projection, to_lat_lon
 from lslam.pipeline.map_files import georeference_of, read_json
 

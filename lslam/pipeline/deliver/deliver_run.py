@@ -17,7 +17,7 @@ from lslam.core.extras import install_command
 from lslam.core.printable import count_of
 from lslam.core.untrusted import MISFIT
 from lslam.io.formats.atomic import atomic_write, write_text
-from lslam.io.formats.geotiff import write_geotiff
+from lslam.io.formats.image_files import write_geotiff
 from lslam.io.formats.las_files import write_las
 from lslam.io.formats.point_files import open_map
 from lslam.io.formats.state_files import read_npz

@@ -19,7 +19,7 @@ from lslam.core.types.trajectory import Trajectory
 from lslam.io.formats.bag_files import Bag, BagTopic, open_bag
 from lslam.io.formats.text_tables import utc_of
 from lslam.io.readers import bag as bag_reader
-from lslam.io.readers.lookup import find_folder
+from lslam.io.readers import find_folder
 from lslam.odometry.frontend.point_times import with_point_times
 from lslam.odometry.integrity.pair_registration import EMPTIED_SHARE, empty_share, filled_directions
 from lslam.pipeline.doctor import Facts, Finding, plural

@@ -21,7 +21,7 @@ from lslam.core.kernels.cache import cache_folder
 from lslam.core.types.arrays import Floats
 from lslam.core.types.cloud import thin_out
 from lslam.core.untrusted import parse_json
-from lslam.io.formats.stored_clouds import MapCloud
+from lslam.io.formats.point_files import MapCloud
 from lslam.maps.georeference import Projection
 from lslam.maps.octree import points_of, write_octree
 from lslam.pipeline.map_files import georeference_of, note_of, read_json

@@ -72,8 +72,7 @@ def test_the_devkit_projection_is_the_documented_amount_off() -> None:
 
 def test_devkit_projection_gives_the_official_ground_truth(recordings: Callable[[str], Path]) -> None:
     """OXTS of sequence 07, carried to camera 0 through the extrinsics of another day, lies within 0.1 m of the truth."""
-    from lslam.io.formats.calibration_files import read_raw_cam0_lidar, read_rigid
-    from lslam.io.formats.kitti_layout import ROLL, YAW, read_oxts
+    from lslam.io.formats.kitti_layout import ROLL, YAW, read_oxts, read_raw_cam0_lidar, read_rigid
 
     oxts = read_oxts(recordings("kitti_raw_oxts_0027") / "kitti_raw_oxts" / "2011_09_30_drive_0027_oxts")
     day = recordings("kitti_raw_0048") / "2011_09_26"

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lslam.maps.kernels.voxel_average import AXIS_BITS, accumulate, enter, unpack
+from lslam.maps.kernels.cells import AXIS_BITS, accumulate, enter, unpack
 
 NO_INTENSITY, NO_TAGS = np.zeros(0, np.float32), np.zeros((0, 3), np.int64)
 ORIGIN = np.zeros(3, np.int64)

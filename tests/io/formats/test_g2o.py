@@ -11,7 +11,7 @@ from g2o_reader import read_g2o
 from lslam.core.errors import InputError, OutputError
 from lslam.core.geometry import noise, se3
 from lslam.core.types.constraint import Constraint
-from lslam.io.formats.g2o import write_g2o
+from lslam.io.formats.trajectory_lines import write_g2o
 
 RNG = np.random.default_rng(3)
 POSES = se3.exp(RNG.normal(size=(5, 6)) * [9, 9, 1, 0.3, 0.3, 2])

@@ -10,7 +10,7 @@ import pytest
 
 from lslam.core.errors import InputError, UsageError
 from lslam.core.geometry import se3
-from lslam.io.formats.calibration_files import (
+from lslam.io.formats.kitti_layout import (
     read_cam0_lidar,
     read_odometry_calib,
     read_raw_cam0_lidar,

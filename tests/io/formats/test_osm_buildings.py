@@ -14,7 +14,7 @@ from shapely import LinearRing, MultiPolygon, Polygon, STRtree, box, points
 from lslam.core.errors import InputError
 from lslam.core.geometry import se3
 from lslam.core.types.building import Building, Footprint, footprint_polygon
-from lslam.io.formats.calibration_files import read_mcd_extrinsics
+from lslam.io.formats.kitti_layout import read_mcd_extrinsics
 from lslam.io.formats.osm_buildings import (
     BuildingExtract,
     buildings_of,
@@ -63,7 +63,7 @@ def test_open_ways_are_skipped_and_counted() -> None:
     maker.way(3, maker.nodes([[0, 30], [9, 30]]), highway="service")
     extract = extract_of(maker)
     assert [b.osm_id for b in extract.buildings] == ["way/1"]
-    assert extract.skipped == {"open way": 1}
+    assert extract.omissions == {"open way": 1}
 
 
 @pytest.mark.parametrize(
@@ -83,7 +83,7 @@ def test_buildings_that_cannot_be_seen_are_skipped_and_counted(tags: dict[str, s
     maker.relation(3, [(2, "outer")], type="multipolygon", **tags)
     extract = extract_of(maker)
     assert extract.buildings == []
-    assert extract.skipped == {reason: 2}
+    assert extract.omissions == {reason: 2}
 
 
 @pytest.mark.parametrize("tags", [{"layer": "0"}, {"layer": "1"}, {"layer": "ground"}, {"location": "roof"}])
@@ -103,7 +103,7 @@ def test_missing_border_nodes_drop_the_element() -> None:
     maker.relation(5, [(2, "outer")], type="multipolygon", building="yes")
     extract = extract_of(maker)
     assert [b.osm_id for b in extract.buildings] == ["way/1"]
-    assert extract.skipped == {"nodes missing": 3}
+    assert extract.omissions == {"nodes missing": 3}
 
 
 def test_outer_parts_are_joined_whichever_way_they_run_and_inners_subtracted() -> None:
@@ -156,7 +156,7 @@ def test_rings_that_do_not_close_drop_the_multipolygon() -> None:
     maker.relation(8, [(2, "inner")], type="multipolygon", building="yes")
     extract = extract_of(maker)
     assert extract.buildings == []
-    assert extract.skipped == {"rings that do not close": 2}
+    assert extract.omissions == {"rings that do not close": 2}
 
 
 def test_an_outline_tagged_as_well_is_one_building_not_two() -> None:
@@ -166,7 +166,7 @@ def test_an_outline_tagged_as_well_is_one_building_not_two() -> None:
     maker.relation(9, [(1, "outer"), (2, "inner")], type="multipolygon", building="yes")
     extract = extract_of(maker)
     assert [b.osm_id for b in extract.buildings] == ["way/2", "relation/9"]
-    assert extract.skipped == {"outline of a multipolygon already read": 1}
+    assert extract.omissions == {"outline of a multipolygon already read": 1}
 
 
 def test_other_relations_and_ways_are_ignored() -> None:
@@ -176,7 +176,7 @@ def test_other_relations_and_ways_are_ignored() -> None:
     maker.relation(3, [(1, "outline")], type="building", building="yes")
     extract = extract_of(maker)
     assert extract.buildings == []
-    assert extract.skipped == {}
+    assert extract.omissions == {}
 
 
 def test_degenerate_outlines_are_counted_and_crossed_ones_repaired() -> None:
@@ -188,7 +188,7 @@ def test_degenerate_outlines_are_counted_and_crossed_ones_repaired() -> None:
     bow = maker.nodes([[0, 20], [10, 30], [10, 20], [0, 30]])
     maker.way(3, [*bow, bow[0]], building="yes")
     extract = extract_of(maker)
-    assert extract.skipped == {"no area": 2}
+    assert extract.omissions == {"no area": 2}
     (building,) = extract.buildings
     assert shape_of(building).is_valid
     assert [f.area for f in building.footprints] == pytest.approx([25, 25], abs=0.01)

@@ -156,7 +156,7 @@ def test_ways_that_are_only_drawn_are_as_good_as_those_with_nodes(tmp_path: Path
     assert [len(drawn.ways[number].nodes) for number in (11, 12, 7, 8)] == [3, 3, 4, 0]
     extract = buildings_of(drawn, np.array([lat, lon, 0.0]))
     assert [round(one.area, 2) for one in extract.buildings] == [40.0, 80.0]
-    assert extract.skipped == {"nodes missing": 1}
+    assert extract.omissions == {"nodes missing": 1}
 
     def xml(corners: list[dict[str, float]]) -> str:
         return "".join(f'<nd lat="{place["lat"]!r}" lon="{place["lon"]!r}"/>' for place in corners)

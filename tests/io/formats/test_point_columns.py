@@ -11,7 +11,7 @@ import pytest
 
 from lslam.core.labels import CLASSES
 from lslam.core.types.cloud import ArrayCloud, in_memory
-from lslam.io.formats.gps_time import gps_time_s
+from lslam.io.formats.las_files import gps_time_s
 from lslam.io.formats.pcd_files import pcd_columns
 from lslam.io.formats.ply_files import ply_columns
 from lslam.io.formats.point_files import read_points, write_cloud

@@ -11,8 +11,7 @@ from scipy.spatial import cKDTree
 
 from lslam.core.errors import InputError
 from lslam.core.types.cloud import BLOCK, ArrayCloud, in_memory
-from lslam.io.formats.point_files import write_cloud
-from lslam.io.formats.stored_clouds import MapCloud, stored_cloud
+from lslam.io.formats.point_files import MapCloud, stored_cloud, write_cloud
 
 
 def coloured(count: int = 1000) -> ArrayCloud:

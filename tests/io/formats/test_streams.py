@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from lslam.core.errors import InputError
 from lslam.core.types.gnss import GnssStream
 from lslam.core.types.imu import ImuStream
-from lslam.io.formats.calibration_files import read_mcd_extrinsics
-from lslam.io.formats.kitti_layout import POS_ACC, read_oxts
+from lslam.io.formats.kitti_layout import POS_ACC, read_mcd_extrinsics, read_oxts
 from lslam.io.formats.stamped_csv import read_gnss_csv, read_imu_csv, write_gnss_csv, write_imu_csv
 from lslam.io.formats.time_columns import read_stamps
 

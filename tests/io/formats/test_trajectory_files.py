@@ -16,15 +16,10 @@ from lslam.core.errors import InputError, LslamError, OutputError, UsageError
 from lslam.core.geometry import se3
 from lslam.core.types.trajectory import Trajectory
 from lslam.io.formats.text_tables import seconds_text, seconds_to_ns
-from lslam.io.formats.trajectory_files import (
-    find_times,
-    read_times,
-    read_trajectory,
-    write_euroc,
-    write_kitti,
-    write_tum,
-)
-from lslam.io.formats.trajectory_formats import FORMATS
+from lslam.io.formats.time_columns import read_times
+from lslam.io.formats.trajectory_csv import write_euroc
+from lslam.io.formats.trajectory_files import FORMATS, read_trajectory
+from lslam.io.formats.trajectory_lines import find_times, write_kitti, write_tum
 
 START = 1_317_042_272_349_659_964
 

@@ -15,9 +15,8 @@ from sequence_builders import T_CAM0_LIDAR, kitti_root, raw_drive, scans
 from lslam.core.errors import InputError
 from lslam.core.geometry import se3
 from lslam.core.types.camera import cameras_of
-from lslam.io.formats.camera_info import CameraInfo
 from lslam.io.formats.image_files import from_pixels, write_png
-from lslam.io.formats.sequence_toml import SequenceInfo, read_sequence_toml, write_sequence_toml
+from lslam.io.formats.sequence_toml import CameraInfo, SequenceInfo, read_sequence_toml, write_sequence_toml
 from lslam.io.readers import open_sequence
 from lslam.pipeline.convert import bag_messages
 

@@ -18,7 +18,7 @@ from lslam.core.types.scan import Scan
 from lslam.core.types.sequence import Sequence
 from lslam.io.formats.point_cloud import cloud_from_fields
 from lslam.io.readers import open_sequence
-from lslam.io.readers.labels import labelled
+from lslam.io.readers.sequence_on_disk import add_labels
 from lslam.odometry import create_odometry
 from lslam.pipeline.convert.convert_sequence import convert_sequence
 from lslam.pipeline.job import choose_scans
@@ -69,7 +69,7 @@ def rows(table: NDArray[np.float32], labels: NDArray[np.uint16], kind: str) -> b
 def test_labels_beside_the_scans_are_those_of_their_points(tmp_path: Path) -> None:
     sequence = open_sequence(labelled_kitti(tmp_path))
     assert sequence.scan(2).labels is None, "nobody asked for them"
-    scan = labelled(sequence).scan(2)
+    scan = add_labels(sequence).scan(2)
     assert scan.labels is not None
     assert scan.labels.dtype == np.uint16
     assert scan.labels.tolist() == np.roll(CLASS_OF, 2).tolist()
@@ -111,7 +111,7 @@ def test_labels_survive_conversion(kind: str, tmp_path: Path) -> None:
     drive = replace(drive, scans=[replace(s, labels=c) for s, c in of_scans if isinstance(s, Scan)])
     out = tmp_path / f"out.{kind}" if kind != "kitti" else tmp_path / "out"
     convert_sequence(drive, kind, out)
-    back = labelled(open_sequence(out))
+    back = add_labels(open_sequence(out))
     for k, own in enumerate(classes):
         labels = back.scan(k).labels
         assert labels is not None

@@ -9,8 +9,7 @@ from sequence_builders import kitti_root, raw_drive
 
 from lslam.core.errors import InputError, UsageError
 from lslam.core.types.sequence import select
-from lslam.io.readers import open_sequence
-from lslam.io.readers.lookup import find_folder
+from lslam.io.readers import find_folder, open_sequence
 
 
 @pytest.mark.parametrize("name", ["seq07", "07", "7", "kitti/07"])

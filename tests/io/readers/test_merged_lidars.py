@@ -254,7 +254,7 @@ def folder_of(path: Path, scans: Listed[Scan], toml: str = "") -> Path:
         assert one.rings is not None
         assert one.intensity is not None
         assert one.times is not None
-        write_scan(path, k, one.points, one.intensity, one.times, one.rings)
+        write_scan(path, k, replace(one, labels=None))
     write_times(path, np.array([one.stamp_ns for one in scans]))
     (path / "sequence.toml").write_text(f'per_point = "per_point"\nvertical_correction_deg = 0\n{toml}')
     return path

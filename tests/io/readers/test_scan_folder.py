@@ -12,7 +12,7 @@ from sequence_builders import cloud, lidar_poses, scans
 from lslam.core.errors import InputError
 from lslam.core.types.trajectory import Trajectory
 from lslam.io.formats.sequence_toml import SequenceInfo, write_sequence_toml
-from lslam.io.formats.trajectory_files import write_tum
+from lslam.io.formats.trajectory_lines import write_tum
 from lslam.io.readers import open_sequence
 
 

@@ -17,7 +17,7 @@ from lslam.core.errors import InputError, OutputExistsError, UsageError
 from lslam.core.geometry import se3
 from lslam.core.types.scan import Scan
 from lslam.core.types.sequence import Calibration, Sequence, select
-from lslam.io.formats.pointcloud2 import decode_pointcloud2
+from lslam.io.formats.sensor_messages import decode_pointcloud2
 from lslam.io.formats.sequence_toml import FILE_NAME, read_sequence_toml
 from lslam.io.readers import open_sequence
 from lslam.pipeline.convert import bag_messages

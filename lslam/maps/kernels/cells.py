@@ -1,0 +1,331 @@
+"""Cells of space in rows of integers, found by an open-addressing hash of their packed indices: averages, and occupancy by rays.
+
+An average's row is (key, sum x, sum y, sum z, count), perhaps (three tags) and perhaps (sum of intensities), int64. The sums are
+offsets from the voxel's centre in units of voxel / 2**24, and intensities in units of 2**-20. So they are exact for all
+coordinates and equal for any order of the points, and rows of one voxel that were summed separately can be added. The tags are
+those of the observation whose first tag is the smallest (`lslam.maps.observations`).
+
+Of occupancy the cell in which a beam ends is hit, cells that it crosses are missed. A row is (key, a, low, high, stamp), int64.
+The updates of a cell are the function x -> clamp(x + a, low, high) of its previous log-odds x. Clamped updates, those of OctoMap
+(Hornung et al. 2013), are closed under composition, so parts of a recording that were summed separately can be joined in their
+order without loss.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.core.kernels.jit import inline, kernel
+from lslam.core.kernels.voxel import AHEAD
+
+AXIS_BITS = 21
+HALF = 1 << (AXIS_BITS - 1)
+_MIX = -7046029254386353131  # 0x9E3779B97F4A7C15 as int64: Fibonacci hashing
+UNITS = float(2**24)  # 2**39 points fit into one voxel's sum
+INTENSITY_UNITS = float(2**20)
+_BRIGHTEST = float(2**24)  # of such points a voxel's sum holds 2**19
+SUMS = 5  # columns before the tags
+_NO_TAG = np.iinfo(np.int64).max
+
+
+@inline
+def pack(ix: int, iy: int, iz: int) -> int:
+    """Key of cell indices relative to the origin; -1 when an index is outside the range of keys."""
+    x, y, z = ix + HALF, iy + HALF, iz + HALF
+    if (x | y | z) >> AXIS_BITS != 0:  # negative or too large on some axis
+        return -1
+    return (x << (2 * AXIS_BITS)) | (y << AXIS_BITS) | z
+
+
+@inline
+def slot_of(key: int, mask: int) -> int:
+    """First slot to try for a key in a table of mask + 1 slots."""
+    mixed = key * _MIX
+    return (mixed ^ (mixed >> 29) ^ (mixed >> 43)) & mask
+
+
+@inline
+def row_of(key: int, slots: NDArray[np.int32], rows: NDArray[np.int64], row_count: int) -> int:
+    """Row of a key.
+
+    A new key is entered in `slots` and gets row number `row_count`, in which only the key is set.
+
+    slots : (S,) row of each hash slot or -1, S a power of two above `row_count`; rows : (R, k), R > `row_count`
+    """
+    mask = slots.shape[0] - 1
+    slot = slot_of(key, mask)
+    row = slots[slot]
+    while row >= 0 and rows[row, 0] != key:
+        slot = (slot + 1) & mask
+        row = slots[slot]
+    if row < 0:
+        row = row_count
+        slots[slot] = row
+        rows[row, 0] = key
+    return int(row)
+
+
+@kernel
+def enter(slots: NDArray[np.int32], rows: NDArray[np.int64], row_count: int) -> None:
+    """Enter the first `row_count` rows into `slots`, all -1 before; the number of slots is a power of two above `row_count`."""
+    mask = slots.shape[0] - 1
+    for row in range(row_count):
+        slot = slot_of(rows[row, 0], mask)
+        while slots[slot] >= 0:
+            slot = (slot + 1) & mask
+        slots[slot] = row
+
+
+def unpack_cells(keys: NDArray[np.int64], origin: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(M, 3) cell indices of keys (M,)."""
+    cells = np.empty((len(keys), 3), np.int64)
+    for axis in range(3):
+        cells[:, axis] = ((keys >> (AXIS_BITS * (2 - axis))) & ((1 << AXIS_BITS) - 1)) - HALF + origin[axis]
+    return cells
+
+
+@kernel
+def accumulate(
+    points: NDArray[np.float32],
+    intensity: NDArray[np.float32],
+    tags: NDArray[np.int64],
+    T: NDArray[np.float64],
+    range_min: float,
+    range_max: float,
+    voxel: float,
+    crop: NDArray[np.float64],
+    origin: NDArray[np.int64],
+    slots: NDArray[np.int32],
+    rows: NDArray[np.int64],
+    row_count: int,
+) -> tuple[int, int, int]:
+    """Add one scan's points to the voxel sums.
+
+    points : (N, 3) sensor frame, m; intensity : (N,) or (0,); tags : (N, 3) or (0, 3); T : (4, 4) world from sensor
+    crop : (6,) x_min, x_max, y_min, y_max, z_min, z_max of the world, m: points outside count as gated
+    origin : (3,) voxel index in the middle of the key range, which reaches 2**20 voxels to each side
+    slots : (S,) row of each hash slot or -1, S a power of two above used + N
+    rows : (R, 5), three columns more for `tags` and one more for `intensity` when they are given, with R >= used + N
+
+    Returns the rows used now, the points refused by the range gate (NaN, Inf and zero points included) and the points
+    outside the key range.
+    """
+    inverse = 1.0 / voxel
+    near, far = range_min * range_min, range_max * range_max
+    with_intensity, with_tags = intensity.shape[0] > 0, tags.shape[0] > 0
+    brightnesses = rows.shape[1] - 1
+    mask = slots.shape[0] - 1
+    gated = 0
+    outside = 0
+    # Neighbouring points of a ring mostly share a voxel: they are added up as one run, which is looked up once.
+    keys, sums, bright = np.empty(AHEAD, np.int64), np.empty((AHEAD, 4), np.int64), np.empty(AHEAD, np.int64)
+    numbers, likely = np.empty(AHEAD, np.int64), np.empty(AHEAD, np.int64)
+    for begin in range(0, points.shape[0], AHEAD):
+        run, last_key = -1, -1
+        for i in range(begin, min(begin + AHEAD, points.shape[0])):
+            px, py, pz = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
+            r2 = px * px + py * py + pz * pz
+            if not (r2 >= near and r2 <= far and r2 > 0.0):
+                gated += 1
+                continue
+            x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
+            y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
+            z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
+            if x < crop[0] or x > crop[1] or y < crop[2] or y > crop[3] or z < crop[4] or z > crop[5]:
+                gated += 1
+                continue
+            x, y, z = x * inverse, y * inverse, z * inverse
+            fx, fy, fz = np.floor(x), np.floor(y), np.floor(z)
+            key = pack(np.int64(fx) - origin[0], np.int64(fy) - origin[1], np.int64(fz) - origin[2])
+            if key < 0:
+                outside += 1
+                continue
+            if key != last_key:
+                run, last_key = run + 1, key
+                keys[run], numbers[run], bright[run] = key, i, 0
+                sums[run, 0], sums[run, 1], sums[run, 2], sums[run, 3] = 0, 0, 0, 0
+            sums[run, 0] += np.int64(np.rint((x - fx - 0.5) * UNITS))
+            sums[run, 1] += np.int64(np.rint((y - fy - 0.5) * UNITS))
+            sums[run, 2] += np.int64(np.rint((z - fz - 0.5) * UNITS))
+            sums[run, 3] += 1
+            if with_intensity and np.isfinite(intensity[i]):
+                brightness = min(max(np.float64(intensity[i]), -_BRIGHTEST), _BRIGHTEST)
+                bright[run] += np.int64(np.rint(brightness * INTENSITY_UNITS))
+            if with_tags and tags[i, 0] < tags[numbers[run], 0]:
+                numbers[run] = i
+        # Table and rows are far larger than the processor's caches: a batch of rows is fetched before a branch depends on one.
+        for k in range(run + 1):
+            likely[k] = slots[slot_of(keys[k], mask)]
+        for k in range(run + 1):
+            if rows[max(likely[k], 0), 0] != keys[k]:
+                likely[k] = -1
+        for k in range(run + 1):
+            row = likely[k]
+            if row < 0:
+                row = row_of(keys[k], slots, rows, row_count)
+                if row == row_count:
+                    row_count += 1
+                    rows[row, 1:] = 0
+                    if with_tags:
+                        rows[row, SUMS] = _NO_TAG
+            for n in range(4):
+                rows[row, 1 + n] += sums[k, n]
+            if with_intensity:
+                rows[row, brightnesses] += bright[k]
+            if with_tags and tags[numbers[k], 0] < rows[row, SUMS]:
+                for n in range(tags.shape[1]):
+                    rows[row, SUMS + n] = tags[numbers[k], n]
+    return row_count, gated, outside
+
+
+def unpack(rows: NDArray[np.int64], origin: NDArray[np.int64], voxel: float) -> NDArray[Any]:
+    """(M, 3) float64 mean positions, m, of finished rows (M, 5 or more)."""
+    cells = unpack_cells(rows[:, 0], origin)
+    points = (cells + 0.5 + rows[:, 1:4] / (rows[:, 4:5] * UNITS)) * voxel
+    return np.asarray(points)
+
+
+@inline
+def _seen_row(key: int, slots: NDArray[np.int32], rows: NDArray[np.int64], row_count: int) -> int:
+    """Row of a key; for a new key the new row number `row_count`, without any update."""
+    row = row_of(key, slots, rows, row_count)
+    if row == row_count:
+        rows[row, 1] = 0
+        rows[row, 2] = -(1 << 40)
+        rows[row, 3] = 1 << 40
+        rows[row, 4] = -1
+    return row
+
+
+@inline
+def _update(rows: NDArray[np.int64], row: int, change: int, low: int, high: int) -> None:
+    rows[row, 1] += change
+    rows[row, 2] = min(max(rows[row, 2] + change, low), high)
+    rows[row, 3] = min(max(rows[row, 3] + change, low), high)
+
+
+@kernel
+def mark_ends(
+    points: NDArray[np.float32],
+    T: NDArray[np.float64],
+    range_min: float,
+    range_max: float,
+    voxel: float,
+    origin: NDArray[np.int64],
+    slots: NDArray[np.int32],
+    rows: NDArray[np.int64],
+    row_count: int,
+    stamp: int,
+    model: NDArray[np.int64],
+) -> tuple[int, NDArray[np.float64]]:
+    """Update the cells in which beams end, once each; returns the rows used now, and the ends (E, 3) of the beams, in cells.
+
+    points : (N, 3) sensor frame, m; T : (4, 4) world from sensor; origin : (3,) cell in the middle of the key range
+    stamp : number of the scan; model : log-odds of a hit and of a miss, and their lower and upper bound
+    Beams longer than `range_max`, m, end there without a hit. Only one beam per end cell is returned.
+    """
+    ends = np.empty((len(points), 3))
+    count = 0
+    inverse = 1.0 / voxel
+    near = range_min * range_min
+    for far in range(2):  # hits first: a cell that a scan hits is not missed by the same scan
+        for i in range(len(points)):
+            x, y, z = float(points[i, 0]), float(points[i, 1]), float(points[i, 2])
+            r2 = x * x + y * y + z * z
+            if not (r2 >= near and r2 > 0.0 and np.isfinite(r2)):
+                continue
+            r = math.sqrt(r2)
+            if (r > range_max) != (far == 1):
+                continue
+            if far:
+                s = range_max / r
+                x, y, z = x * s, y * s, z * s
+            cx = (T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]) * inverse
+            cy = (T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]) * inverse
+            cz = (T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]) * inverse
+            ix, iy, iz = np.int64(np.floor(cx)), np.int64(np.floor(cy)), np.int64(np.floor(cz))
+            key = pack(ix - origin[0], iy - origin[1], iz - origin[2])
+            if key < 0:
+                continue
+            row = _seen_row(key, slots, rows, row_count)
+            row_count += row == row_count
+            if rows[row, 4] == stamp:
+                continue
+            rows[row, 4] = stamp
+            _update(rows, row, model[1] if far else model[0], model[2], model[3])
+            ends[count, 0], ends[count, 1], ends[count, 2] = cx, cy, cz
+            count += 1
+    return row_count, ends[:count]
+
+
+@kernel
+def carve(
+    ends: NDArray[np.float64],
+    begin: int,
+    start: NDArray[np.float64],
+    longest: int,
+    origin: NDArray[np.int64],
+    slots: NDArray[np.int32],
+    rows: NDArray[np.int64],
+    row_count: int,
+    stamp: int,
+    model: NDArray[np.int64],
+) -> tuple[int, int]:
+    """Update the cells that the beams cross before their ends with a miss, once each (Amanatides and Woo 1987).
+
+    start : (3,) common start of the beams, in cells; ends : (E, 3), in cells; longest : most cells that a beam crosses
+    Returns the rows used now, and the index of the first beam that was not cast because `rows` was full, else len(ends).
+    """
+    cell = np.empty(3, np.int64)
+    last = np.empty(3, np.int64)
+    step = np.empty(3, np.int64)
+    due = np.empty(3)
+    each = np.empty(3)
+    for i in range(begin, len(ends)):
+        if row_count + longest > rows.shape[0]:
+            return row_count, i
+        for k in range(3):
+            d = ends[i, k] - start[k]
+            cell[k] = np.int64(np.floor(start[k]))
+            last[k] = np.int64(np.floor(ends[i, k]))
+            step[k] = 1 if d > 0 else -1
+            each[k] = abs(1.0 / d) if d != 0.0 else np.inf
+            edge = cell[k] + 1.0 - start[k] if d > 0 else start[k] - cell[k]
+            due[k] = edge * each[k] if d != 0.0 else np.inf
+        for _ in range(longest):
+            if cell[0] == last[0] and cell[1] == last[1] and cell[2] == last[2]:
+                break
+            key = pack(cell[0] - origin[0], cell[1] - origin[1], cell[2] - origin[2])
+            if key >= 0:
+                row = _seen_row(key, slots, rows, row_count)
+                row_count += row == row_count
+                if rows[row, 4] != stamp:
+                    rows[row, 4] = stamp
+                    _update(rows, row, model[1], model[2], model[3])
+            k = 0 if due[0] <= due[1] and due[0] <= due[2] else 1 if due[1] <= due[2] else 2
+            if due[k] > 1.0:
+                break
+            cell[k] += step[k]
+            due[k] += each[k]
+    return row_count, len(ends)
+
+
+@kernel
+def compose(rows: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Composition of rows (N, 5), one row per key (K, 5). They are sorted by key, and those of one key by time."""
+    out = np.empty_like(rows)
+    count = 0
+    for i in range(len(rows)):
+        if count and out[count - 1, 0] == rows[i, 0]:
+            a, low, high = rows[i, 1], rows[i, 2], rows[i, 3]
+            out[count - 1, 1] += a
+            out[count - 1, 2] = min(max(out[count - 1, 2] + a, low), high)
+            out[count - 1, 3] = min(max(out[count - 1, 3] + a, low), high)
+        else:
+            out[count] = rows[i]
+            count += 1
+    return out[:count]
