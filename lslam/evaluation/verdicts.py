@@ -325,18 +325,18 @@ def judge_elbow_at(finding: ExpectedFinding, result: CurveResult) -> Judged:
     values = _scored_values(curve)
     if not values[0] <= target <= values[-1]:
         return "undecided", f"values from {values[0]:g} to {values[-1]:g} were run"
-    plateau_start = _elbow(result)
+    start = _elbow(result)
     place = int(np.searchsorted(values, target))
-    if plateau_start is None or _place(values, plateau_start) > place + 1:
-        return _plateau_is_later(result, target, plateau_start)
-    if plateau_start == values[0]:
-        said = f"there is no elbow: {plateau_start:g}, the smallest value, is as good as the others"
+    if start is None or _place(values, start) > place + 1:
+        return _plateau_is_later(result, target, start)
+    if start == values[0]:
+        said = f"there is no elbow: {start:g}, the smallest value, is as good as the others"
         return _only_if_as_good(_rise_before(curve, values, place)), said
-    said = f"the error is on its plateau from {plateau_start:g} on"
-    rise = _rise_before(curve, values, _place(values, plateau_start))
-    if plateau_start == values[place]:
+    said = f"the error is on its plateau from {start:g} on"
+    rise = _rise_before(curve, values, _place(values, start))
+    if start == values[place]:
         return "confirmed" if rise == "worse" else "undecided", f"{said}; below {BELOW[rise]}"
-    if abs(_place(values, plateau_start) - place) == 1:
+    if abs(_place(values, start) - place) == 1:
         return "undecided", f"{said}, one value beside {target:g}"
     return _only_if_as_good(_rise_before(curve, values, place)), said
 
@@ -347,27 +347,21 @@ def judge_good_from(finding: ExpectedFinding, result: CurveResult) -> Judged:
     values = _scored_values(curve)
     if not values[0] <= target <= values[-1]:
         return "undecided", f"values from {values[0]:g} to {values[-1]:g} were run"
-    plateau_start = _elbow(result)
-    if plateau_start is None or plateau_start > target:
-        return _plateau_is_later(result, target, plateau_start)
+    start = _elbow(result)
+    if start is None or start > target:
+        return _plateau_is_later(result, target, start)
     below = rise_below(curve, target)
     outcomes: dict[Rise, Outcome] = {"worse": "confirmed", "as good": "refuted", "unknown": "undecided"}
     return outcomes[below], f"the error is on its plateau from {target:g} on; below {target:g} {BELOW[below]}"
 
 
-def _plateau_is_later(result: CurveResult, target: float, plateau_start: float | None) -> Judged:
+def _plateau_is_later(result: CurveResult, target: float, start: float | None) -> Judged:
     """Refuted if a value from the expected one to the plateau is worse by more than the scatter over seeds, else undecided."""
     curve = result.curve
     values = _scored_values(curve)
     level = plateau(curve, float(values[len(values) // 2]))
-    said = (
-        "the error comes to no plateau"
-        if plateau_start is None
-        else f"the error is on its plateau from {plateau_start:g} on"
-    )
-    before = np.flatnonzero(
-        (curve.values >= target) & (curve.values < (np.inf if plateau_start is None else plateau_start))
-    )
+    said = "the error comes to no plateau" if start is None else f"the error is on its plateau from {start:g} on"
+    before = np.flatnonzero((curve.values >= target) & (curve.values < (np.inf if start is None else start)))
     if any(rise_at(curve, int(index), level) == "worse" for index in before):
         return "refuted", said
     return "undecided", f"{said}, but before it no error is worse by more than the seeds scatter"

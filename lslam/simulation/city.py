@@ -81,7 +81,7 @@ class City:
 
 
 @dataclass(frozen=True)
-class Site:
+class StreetSite:
     """A place while it is built along a street: its mesh so far, its ground, its measures, and the generator of what varies."""
 
     builder: MeshBuilder
@@ -91,11 +91,11 @@ class Site:
     rng: np.random.Generator
 
     @classmethod
-    def begin(cls, street: RouteCurve, terrain: Terrain, layout: Layout, rng: np.random.Generator) -> Site:
+    def begin(cls, street: RouteCurve, terrain: Terrain, layout: Layout, rng: np.random.Generator) -> StreetSite:
         """A place without anything."""
         return cls(MeshBuilder(), street, terrain, layout, rng)
 
-    def along(self, street: RouteCurve) -> Site:
+    def along(self, street: RouteCurve) -> StreetSite:
         """The same place along another street."""
         return replace(self, street=street)
 
@@ -115,7 +115,7 @@ class Site:
 
 def build_city(street: RouteCurve, terrain: Terrain, layout: Layout, rng: np.random.Generator) -> City:
     """Build a town along `street`. The same generator state gives the same town."""
-    site = Site.begin(street, terrain, layout, rng)
+    site = StreetSite.begin(street, terrain, layout, rng)
     add_road(site)
     add_ground(site, [street], 0.75 * layout.pavement)
     lots = Lots([street], layout)
@@ -168,7 +168,7 @@ def _circle(corners: Floats) -> tuple[float, float, float]:
     return float(middle[0]), float(middle[1]), float(np.linalg.norm(corners - middle, axis=1).max())
 
 
-def add_road(site: Site, away: Callable[[Floats], Floats] | None = None) -> None:
+def add_road(site: StreetSite, away: Callable[[Floats], Floats] | None = None) -> None:
     """Add road, kerbs and pavements as one strip along the street.
 
     away : distance of places (..., 2) to the nearest middle of a road, m: where another road crosses there is no kerb
@@ -195,7 +195,7 @@ def add_road(site: Site, away: Callable[[Floats], Floats] | None = None) -> None
     site.builder.add(grid_vertices(xy, z), faces, kinds)
 
 
-def add_ground(site: Site, streets: list[RouteCurve], overlap: float, level: float = KERB - 0.07) -> None:
+def add_ground(site: StreetSite, streets: list[RouteCurve], overlap: float, level: float = KERB - 0.07) -> None:
     """Add grass everywhere but on `streets`, `level` m above the terrain.
 
     It reaches `overlap` m under pavements, or under roads without any. The level is a little below theirs, so that their edge
@@ -214,7 +214,7 @@ def add_ground(site: Site, streets: list[RouteCurve], overlap: float, level: flo
     site.builder.add(grid_vertices(xy, z), faces[~under_road[faces].any(axis=1)], Surface.LAWN)
 
 
-def add_row(site: Site, lots: Lots, side: int, first: bool) -> None:
+def add_row(site: StreetSite, lots: Lots, side: int, first: bool) -> None:
     """Add houses side by side along one side of the street (1 left, -1 right), where there is room."""
     street, layout, rng = site.street, site.layout, site.rng
     s, setback = rng.uniform(0, 4), rng.uniform(*layout.setback)
@@ -261,7 +261,7 @@ def lot(front: Floats, tangent: Floats, width: float, depth: float) -> Floats:
     return np.array([front - half, front + half, front + half + depth * inward, front - half + depth * inward])
 
 
-def _add_front_garden(site: Site, width: float, setback: float, front: Floats, yaw: float) -> None:
+def _add_front_garden(site: StreetSite, width: float, setback: float, front: Floats, yaw: float) -> None:
     """Add a hedge or a low wall between garden and pavement."""
     rng = site.rng
     kind = rng.random()
@@ -276,7 +276,9 @@ def _add_front_garden(site: Site, width: float, setback: float, front: Floats, y
     site.builder.add_mesh(part, place, yaw)
 
 
-def add_street_furniture(site: Site, side: int, is_free: Callable[[Floats, float, float], bool] | None = None) -> None:
+def add_street_furniture(
+    site: StreetSite, side: int, is_free: Callable[[Floats, float, float], bool] | None = None
+) -> None:
     """Add parked cars, trees, poles and bins along one side.
 
     `is_free` tells whether a place (2,), with its offset and yaw, is free.
@@ -304,7 +306,7 @@ def add_street_furniture(site: Site, side: int, is_free: Callable[[Floats, float
         place(furniture.bins(rng), s, layout.band - 0.5, KERB)
 
 
-def add_garden_trees(site: Site, lots: Lots) -> None:
+def add_garden_trees(site: StreetSite, lots: Lots) -> None:
     """Add trees wherever a random place is free."""
     count, rng = site.layout.garden_trees, site.rng
     if not count:

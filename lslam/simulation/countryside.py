@@ -10,7 +10,7 @@ from lslam.core.errors import UsageError
 from lslam.core.geometry import portable
 from lslam.core.types.arrays import Floats
 from lslam.simulation import furniture
-from lslam.simulation.city import City, Layout, Site, add_ground, lot
+from lslam.simulation.city import City, Layout, StreetSite, add_ground, lot
 from lslam.simulation.curve import RouteCurve, Terrain, smooth_curve
 from lslam.simulation.scene_mesh import MeshBuilder, Surface, grid_faces
 
@@ -44,14 +44,14 @@ IN_USE = 0.7  # share of blocks with such a stretch
 Houses = list[tuple[Floats, float]]  # outline (4, 2) and height of each, m
 
 
-def _city(site: Site, houses: Houses) -> City:
+def _city(site: StreetSite, houses: Houses) -> City:
     outlines, heights = [outline for outline, _ in houses], [height for _, height in houses]
     return City(site.builder.build(), site.terrain, site.street, outlines, heights, [site.street])
 
 
 def build_motorway(street: RouteCurve, terrain: Terrain, layout: Layout, rng: np.random.Generator) -> City:
     """Build two carriageways with guard rails, delineators, gantries and a noise barrier; beyond them trees and bushes."""
-    site = Site.begin(street, terrain, layout, rng)
+    site = StreetSite.begin(street, terrain, layout, rng)
     _add_strip(site, [0.0, 3.0, 6.0, 9.0, layout.road, layout.band])
     add_ground(site, [street], 1.2, VERGE)
     for offset in (-layout.road - 0.6, 0.0, layout.road + 0.6):
@@ -72,7 +72,7 @@ def build_corridor(street: RouteCurve, terrain: Terrain, layout: Layout, rng: np
 
     Only the openings between the barriers, with houses, trees and lamps, make the position along the street observable.
     """
-    site = Site.begin(street, terrain, layout, rng)
+    site = StreetSite.begin(street, terrain, layout, rng)
     _add_strip(site, [0.0, 2.0, layout.road, layout.band])
     add_ground(site, [street], 1.2, VERGE)
     inside = layout.band - 0.3
@@ -93,7 +93,7 @@ def build_corridor(street: RouteCurve, terrain: Terrain, layout: Layout, rng: np
     return _city(site, houses)
 
 
-def _fill_opening(site: Site, s: float, side: int) -> tuple[Floats, float]:
+def _fill_opening(site: StreetSite, s: float, side: int) -> tuple[Floats, float]:
     """Add a house behind an opening of the barrier, and lamps, a cabinet and two trees before it.
 
     Returns the house's outline and height.
@@ -110,7 +110,7 @@ def _fill_opening(site: Site, s: float, side: int) -> tuple[Floats, float]:
     return _add_house(site, s + rng.uniform(-5, 5), side * (layout.band + 7.0), width, depth)
 
 
-def _add_house(site: Site, s: float, offset: float, width: float, depth: float) -> tuple[Floats, float]:
+def _add_house(site: StreetSite, s: float, offset: float, width: float, depth: float) -> tuple[Floats, float]:
     """Add a house that faces the street, its front `offset` m to the left. Returns its outline (4, 2) and height."""
     side = np.sign(offset)
     front, tangent = site.beside(s, offset), side * site.street.tangent(np.array([s]))[0]
@@ -119,7 +119,7 @@ def _add_house(site: Site, s: float, offset: float, width: float, depth: float) 
     return lot(front, tangent, width, depth), float(building.vertices[:, 2].max())
 
 
-def _add_strip(site: Site, half: list[float]) -> None:
+def _add_strip(site: StreetSite, half: list[float]) -> None:
     """Add a road without kerbs, as wide as the largest of `half`, m, on both sides."""
     s = site.street.sample(1.0)
     xy = np.stack([site.street.beside(s, d) for d in [-d for d in half[:0:-1]] + half])
@@ -127,7 +127,7 @@ def _add_strip(site: Site, half: list[float]) -> None:
     site.builder.add_grid(xy, z, Surface.ROAD)
 
 
-def _add_rail(site: Site, offset: float) -> None:
+def _add_rail(site: StreetSite, offset: float) -> None:
     """Add a guard rail: a band along the road and a post every 4 m."""
     _add_wall(site, site.street.sample(4.0), offset, RAIL[1], Surface.FENCE, RAIL[0], 0.1)
     for s in site.street.sample(4.0):
@@ -135,7 +135,7 @@ def _add_rail(site: Site, offset: float) -> None:
 
 
 def _add_wall(
-    site: Site,
+    site: StreetSite,
     s: Floats,
     offset: float,
     top: float,
@@ -151,14 +151,14 @@ def _add_wall(
     site.builder.add(np.concatenate(rows), grid_faces(4, len(s)), surface)
 
 
-def _add_box(site: Site, s: float, offset: float, low: list[float], high: list[float], surface: Surface) -> None:
+def _add_box(site: StreetSite, s: float, offset: float, low: list[float], high: list[float], surface: Surface) -> None:
     """Add a box in the street's frame, `s` m along and `offset` m to the left."""
     part = MeshBuilder()
     part.add_box(low, high, surface)
     site.stand(part.build(), site.beside(s, offset), site.yaw(s))
 
 
-def _add_gantry(site: Site, s: float, reach: float) -> None:
+def _add_gantry(site: StreetSite, s: float, reach: float) -> None:
     """Add a bridge of signs over the right carriageway."""
     for offset in (-reach, 0.0):
         _add_box(site, s, offset, [-0.2, -0.2, -0.5], [0.2, 0.2, 7.2], Surface.POLE)
@@ -166,7 +166,7 @@ def _add_gantry(site: Site, s: float, reach: float) -> None:
     _add_box(site, s, -0.5 * reach, [-0.35, -3.0, 5.6], [-0.25, 3.0, 8.0], Surface.FENCE)
 
 
-def _add_country(site: Site) -> Houses:
+def _add_country(site: StreetSite) -> Houses:
     """Add clumps of trees, bushes, and a few farms. Returns outlines and heights of the farms."""
     layout, rng = site.layout, site.rng
     houses: Houses = []
@@ -193,7 +193,7 @@ def build_woods(street: RouteCurve, terrain: Terrain, layout: Layout, rng: np.ra
     Of `layout` it takes the road's half width and verge (`pavement`), `garden_trees` per 5 m of way and side, of which the
     share `trees` grows, and hedges beside the way by the share of `gardens`; bins and lamps; a house by `openings`.
     """
-    site = Site.begin(street, terrain, layout, rng)
+    site = StreetSite.begin(street, terrain, layout, rng)
     _add_strip(site, sorted({0.0, 0.5 * layout.road, layout.road, layout.band}))
     add_ground(site, [street], 0.6 * layout.pavement, VERGE)
     way = street.position(street.sample(0.5))
@@ -204,7 +204,7 @@ def build_woods(street: RouteCurve, terrain: Terrain, layout: Layout, rng: np.ra
     return _city(site, houses)
 
 
-def _add_trees(site: Site, way: Floats, outlines: list[Floats]) -> None:
+def _add_trees(site: StreetSite, way: Floats, outlines: list[Floats]) -> None:
     """Add random trees and bushes, denser near the path, none on it or in a house."""
     from scipy.spatial import cKDTree
 
@@ -226,7 +226,7 @@ def _add_trees(site: Site, way: Floats, outlines: list[Floats]) -> None:
             site.stand(part, xy, rng.uniform(0, 2 * np.pi), VERGE)
 
 
-def _add_hedges(site: Site) -> None:
+def _add_hedges(site: StreetSite) -> None:
     """Add hedges along both edges of the path."""
     layout, rng = site.layout, site.rng
     for side in (1, -1):
@@ -237,7 +237,7 @@ def _add_hedges(site: Site) -> None:
                 site.stand(part, site.beside(at, side * (layout.band + 0.8)), site.yaw(at), VERGE)
 
 
-def _add_objects(site: Site) -> None:
+def _add_objects(site: StreetSite) -> None:
     """Add lamps and bins beside the path."""
     layout, rng, length = site.layout, site.rng, site.street.length
     for is_there, part, apart in ((layout.poles, furniture.pole, 35.0), (layout.bins, furniture.bins, 60.0)):
@@ -248,7 +248,7 @@ def _add_objects(site: Site) -> None:
             site.stand(part(rng), xy, rng.uniform(0, 2 * np.pi), VERGE)
 
 
-def _add_lodges(site: Site, way: Floats) -> Houses:
+def _add_lodges(site: StreetSite, way: Floats) -> Houses:
     """Add a few houses, clear of every bend of the path. Returns outlines and heights."""
     layout, rng, length = site.layout, site.rng, site.street.length
     houses: Houses = []
@@ -279,7 +279,7 @@ def build_carpark(
     middle, half = 0.5 * (low[1] + high[1]), 0.5 * float(high[1] - low[1])
     axis = smooth_curve(np.array([[low[0] - ENDS, middle], [high[0] + ENDS, middle]]), closed=False)
     side, away = (1 if walls.random() < 0.5 else -1), half + walls.uniform(*WALL_AWAY)
-    site = Site.begin(axis, terrain, layout, ground)
+    site = StreetSite.begin(axis, terrain, layout, ground)
     _add_bumps(site, low, high, roughness)
     top = walls.uniform(*WALL_HEIGHTS_M)
     _add_wall(site, axis.sample(2.0), side * away, top, Surface.WALL, thickness=WALL_THICKNESS)
@@ -291,7 +291,7 @@ def build_carpark(
     return _city(replace(site, street=line), _add_house_row(replace(site, rng=houses), -side, half))
 
 
-def _add_bumps(site: Site, low: Floats, high: Floats, roughness: float) -> None:
+def _add_bumps(site: StreetSite, low: Floats, high: Floats, roughness: float) -> None:
     """Add ground without holes, with random bumps."""
     x, y = (_grid_lines(float(low[k]), float(high[k])) for k in (0, 1))
     if len(x) * len(y) > MOST_BUMPS:
@@ -312,7 +312,7 @@ def _grid_lines(low: float, high: float) -> Floats:
     return np.concatenate([fine[0] - beyond[::-1], fine, fine[-1] + beyond])
 
 
-def _add_tree_row(site: Site, wall: float) -> None:
+def _add_tree_row(site: StreetSite, wall: float) -> None:
     """Add a row of trees behind the wall, which is `wall` m to the left of the axis."""
     layout, rng = site.layout, site.rng
     s = rng.uniform(*TREES_APART)
@@ -324,7 +324,7 @@ def _add_tree_row(site: Site, wall: float) -> None:
         s += rng.uniform(*TREES_APART)
 
 
-def _add_cars(site: Site, offset: float) -> None:
+def _add_cars(site: StreetSite, offset: float) -> None:
     """Add a row of parking bays across the axis, their middles `offset` m to its left; some hold a car."""
     rng, end = site.rng, site.street.length
     for block in np.arange(0.0, end, BLOCK):
@@ -337,7 +337,7 @@ def _add_cars(site: Site, offset: float) -> None:
                 site.stand(furniture.parked_car(rng), xy, yaw)
 
 
-def _add_house_row(site: Site, side: int, half: float) -> Houses:
+def _add_house_row(site: StreetSite, side: int, half: float) -> Houses:
     """Add houses that face the car park, `layout.setback` m from the path. Returns their outlines and heights."""
     layout, rng = site.layout, site.rng
     houses: Houses = []

@@ -18,7 +18,7 @@ from lslam.simulation.city import (
     City,
     Layout,
     Lots,
-    Site,
+    StreetSite,
     add_garden_trees,
     add_road,
     add_street_furniture,
@@ -77,7 +77,7 @@ def build_osm_city(
     _add_ground(builder, built, terrain, network, layout.band, rng)
     outlines = [(footprint.outer, building.height or 0.0) for building in built for footprint in building.footprints]
     if network is not None:
-        _furnish(Site(builder, roads[0], terrain, layout, rng), network, outlines)
+        _furnish(StreetSite(builder, roads[0], terrain, layout, rng), network, outlines)
     return OsmCity(
         builder.build(),
         terrain,
@@ -130,7 +130,7 @@ def _add_ground(
     builder.add_grid(xy, z, Surface.LAWN)
 
 
-def _furnish(site: Site, network: Network, outlines: list[tuple[Floats, float]]) -> None:
+def _furnish(site: StreetSite, network: Network, outlines: list[tuple[Floats, float]]) -> None:
     """Add roads with kerbs, and beside them cars, trees, poles and bins wherever no building is in the way."""
     sites = [site.along(street) for street in network.streets]
     for road in sites:

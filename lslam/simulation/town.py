@@ -13,7 +13,7 @@ from lslam.simulation.city import (
     City,
     Layout,
     Lots,
-    Site,
+    StreetSite,
     add_garden_trees,
     add_ground,
     add_road,
@@ -62,7 +62,7 @@ def build_town(
         newest = _side_streets(newest, streets, layout, spacing, rng)
         streets = [*streets, *newest]
     network = Network(streets)
-    place = Site.begin(main[0], terrain, layout, rng)
+    place = StreetSite.begin(main[0], terrain, layout, rng)
     sites = [place.along(street) for street in streets]
     for site in sites:
         add_road(site, network.distance)
