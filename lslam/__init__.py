@@ -20,13 +20,13 @@ if TYPE_CHECKING:
     from lslam.pipeline.run import run
     from lslam.registration.registration import Registration
     from lslam.simulation.scenarios import simulate
-    from lslam.studies.from_python import compare
+    from lslam.studies.compare import compare
 
 __all__ = ["Registration", "__version__", "compare", "evaluate", "load_config", "open_sequence", "run", "simulate"]
 
 _HOMES = {
     "Registration": ("lslam.registration.registration", "Registration"),
-    "compare": ("lslam.studies.from_python", "compare"),
+    "compare": ("lslam.studies.compare", "compare"),
     "evaluate": ("lslam.evaluation.evaluate", "evaluate"),
     "load_config": ("lslam.core.config.config", "load_config"),
     "open_sequence": ("lslam.io.readers", "open_sequence"),

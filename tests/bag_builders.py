@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.core.types.scan import Scan
-from lslam.pipeline.convert import bag_messages
-from lslam.pipeline.convert.bag_writer import BagWriter
+from lslam.pipeline.convert.bag_writer import BagMessages, BagWriter
 
 START_NS = 1_700_000_000_123_456_789
 STEP_NS = 100_000_000
@@ -44,7 +43,7 @@ def clouds(count: int, topic: str = "/points", frame: str = "lidar", n: int = 40
     def fill(writer: BagWriter) -> None:
         for k in range(count):
             one = scan(k, n)
-            writer.write(topic, one.stamp_ns, bag_messages.cloud(writer.store, one, frame))
+            writer.write(topic, one.stamp_ns, writer.messages.cloud(one, frame))
 
     return fill
 
@@ -57,7 +56,7 @@ def imu(count: int, start_ns: int = START_NS, topic: str = "/imu", frame: str = 
         for k in range(count):
             accel, gyro = rng.normal(0, 1, 3) + GRAVITY, rng.normal(0, 0.1, 3)
             stamp = start_ns + k * 10_000_000
-            writer.write(topic, stamp, bag_messages.imu(writer.store, stamp, accel, gyro, frame))
+            writer.write(topic, stamp, writer.messages.imu(stamp, accel, gyro, frame))
 
     return fill
 
@@ -66,7 +65,7 @@ def transforms(pairs: dict[tuple[str, str], NDArray[np.float64]]) -> Fill:
     """/tf_static."""
 
     def fill(writer: BagWriter) -> None:
-        writer.write("/tf_static", START_NS, bag_messages.transforms(writer.store, START_NS, pairs))
+        writer.write("/tf_static", START_NS, writer.messages.transforms(START_NS, pairs))
 
     return fill
 
@@ -95,7 +94,7 @@ def raw_cloud(
     rows = table.view(np.uint8).reshape(height, width * dtype.itemsize)
     data = np.hstack([rows, np.full((height, padding), 0xAB, np.uint8)])
     return store.types["sensor_msgs/msg/PointCloud2"](
-        header=bag_messages.header(store, stamp_ns, frame),
+        header=BagMessages(store).header(stamp_ns, frame),
         height=height,
         width=width,
         fields=[

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 from rosbags.typesys import get_types_from_msg
 
-from lslam.pipeline.convert import bag_messages
 from lslam.pipeline.convert.bag_writer import BagWriter
 
 Frame = tuple[int, bytes]  # when it arrived, ns, and what
@@ -37,12 +36,12 @@ def velodyne_scans(
         group = frames[begin : begin + per_message]
         packets = [
             types["velodyne_msgs/msg/VelodynePacket"](
-                stamp=bag_messages.header(writer.store, at if is_stamped else 0, "").stamp,
+                stamp=writer.messages.header(at if is_stamped else 0, "").stamp,
                 data=np.frombuffer(data, np.uint8),
             )
             for at, data in group
         ]
-        head = bag_messages.header(writer.store, group[0][0] if is_stamped else 0, "velodyne")
+        head = writer.messages.header(group[0][0] if is_stamped else 0, "velodyne")
         writer.write(topic, group[-1][0], types["velodyne_msgs/msg/VelodyneScan"](header=head, packets=packets))
 
 

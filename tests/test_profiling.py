@@ -11,7 +11,7 @@ from typing import Any, cast
 
 import pytest
 
-from lslam.cli import profiling
+from lslam.cli import one_run
 from lslam.core.errors import OutputError
 
 
@@ -35,7 +35,7 @@ def seconds_in(document: dict[str, Any], thread: str, function: str) -> float:
 
 def test_seconds_are_where_they_were_spent(tmp_path: Path) -> None:
     other = threading.Thread(target=rest, args=(0.4,), name="resting")
-    with profiling.profiled(tmp_path / "p.json"):
+    with one_run.profile_to(tmp_path / "p.json"):
         other.start()
         spin(0.3)
         other.join()
@@ -54,9 +54,9 @@ def test_seconds_are_where_they_were_spent(tmp_path: Path) -> None:
 
 
 def test_a_long_run_is_looked_at_less_often(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(profiling, "MAX_STACKS", 10)
-    monkeypatch.setattr(profiling, "INTERVAL_S", 0.001)
-    profile = profiling.StackProfile()
+    monkeypatch.setattr(one_run, "MAX_STACKS", 10)
+    monkeypatch.setattr(one_run, "INTERVAL_S", 0.001)
+    profile = one_run.StackProfile()
     profile.start()
     for _ in range(60):
         spin(0.005)
@@ -68,13 +68,13 @@ def test_a_long_run_is_looked_at_less_often(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_it_is_written_when_the_block_fails(tmp_path: Path) -> None:
-    with pytest.raises(KeyboardInterrupt), profiling.profiled(tmp_path / "p.json"):
+    with pytest.raises(KeyboardInterrupt), one_run.profile_to(tmp_path / "p.json"):
         raise KeyboardInterrupt
     assert json.loads((tmp_path / "p.json").read_text())["exporter"].startswith("lslam")
 
 
 def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
-    with pytest.raises(OutputError, match=r"p\.json"), profiling.profiled(tmp_path / "none" / "p.json"):
+    with pytest.raises(OutputError, match=r"p\.json"), one_run.profile_to(tmp_path / "none" / "p.json"):
         pass
 
 
@@ -82,6 +82,6 @@ def test_a_frame_between_two_lines_has_the_line_of_its_function() -> None:
     class Between:
         f_code, f_lineno, f_back = spin.__code__, None, None
 
-    outer, inner = profiling.stack_of(cast(FrameType, Between()))
+    outer, inner = one_run.stack_of(cast(FrameType, Between()))
     assert outer == ("spin", spin.__code__.co_filename, spin.__code__.co_firstlineno)
     assert inner[0] == "def spin(seconds: float) -> None:"

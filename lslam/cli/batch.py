@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shlex
 import sys
 from contextlib import ExitStack
@@ -12,16 +11,16 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lslam.cli import options
-from lslam.cli.console import log, setup_logging, show
+from lslam.cli.console import log, setup_logging, show, show_json
 from lslam.core.errors import GateError, InputError, LslamError, RunFailedError, UsageError
 from lslam.io.remote import RemotePath, as_path
-from lslam.studies.output import BATCH, require_free
+from lslam.studies.options import BATCH, require_free
 
 if TYPE_CHECKING:
     from lslam.core.types.study import StudyRow
-    from lslam.studies.batch import RunLine
-    from lslam.studies.expanded_study import ExpandedStudy
-    from lslam.studies.output import OutputOptions
+    from lslam.studies.jobs import ExpandedStudy
+    from lslam.studies.options import OutputOptions
+    from lslam.studies.study_runs import RunLine
 
 # Options of `lslam run` that belong to the whole batch.
 _OF_THE_BATCH = ("resume", "overwrite", "dry_run", "as_json")
@@ -32,12 +31,12 @@ _OF_THE_BATCH = ("resume", "overwrite", "dry_run", "as_json")
     "          lslam batch - --out runs/tonight < lines.txt"
 )
 @click.argument("jobs_file", metavar="JOBS.toml|-", type=click.Path(path_type=Path))
-@click.option("--dry-run", is_flag=True, help="List the runs, write nothing.")
-@options.studied
+@options.flag("--dry-run", "List the runs, write nothing.")
+@options.study_output
 @options.engine
 @options.data_root
 @options.set_in_all_runs
-@click.option("--strict", is_flag=True, help="Exit 4 when a run was degraded.")
+@options.flag("--strict", "Exit 4 when a run was degraded.")
 @options.as_json
 @options.verbosity
 def command(jobs_file: Path, **given: Any) -> None:
@@ -50,16 +49,16 @@ def command(jobs_file: Path, **given: Any) -> None:
     options.check_engine(given)
     output = options.output_of(given, "batch")
     if not given["dry_run"]:
-        require_free(output.out, BATCH, "batch", output.overwrite, output.resume)
-    expanded = _expand(jobs_file, output, given)
+        require_free(output, BATCH)
+    study = _expand(jobs_file, output, given)
     if given["dry_run"]:
-        _print_plan(expanded, given["as_json"])
+        _print_plan(study, given["as_json"])
         return
     from lslam.cli.console import bars
-    from lslam.studies.expanded_study import make_runs
+    from lslam.studies.jobs import make_runs
 
     with options.engine_of(given, "runs", is_persistent=False) as engine, ExitStack() as stack:
-        rows = make_runs(expanded, output, engine, bars(stack))
+        rows = make_runs(study, output, engine, bars(stack))
     _print(rows, output.out, given["as_json"])
     log.info("every run: %s", output.out / "results.csv")
     _judge(rows, given["strict"])
@@ -72,10 +71,10 @@ def _expand(path: Path, output: OutputOptions, given: dict[str, Any]) -> Expande
 
         check_settings(given["settings"])
         batch = read_batch(path)
-        from lslam.studies.batch import expand_batch
+        from lslam.studies.study_runs import expand_batch
 
         return expand_batch(batch, output, given["settings"])
-    from lslam.studies.batch import expand_lines, run_words
+    from lslam.studies.study_runs import expand_lines, run_words
 
     lines = [_line(number, words, given) for number, words in run_words(sys.stdin.read())]
     if not lines:
@@ -87,30 +86,30 @@ def _line(number: int, words: list[str], given: dict[str, Any]) -> RunLine:
     """The run of one line, parsed as by `lslam run`; raises the errors of that command with the number of the line."""
     from lslam.cli.one_run import read_truth
     from lslam.cli.run import command as run_command
-    from lslam.cli.run import opened_with, resolved
+    from lslam.cli.run import open_with, resolve
     from lslam.io.readers import find_folder
-    from lslam.studies.batch import listed_line, opened_line, refused_line
+    from lslam.studies.study_runs import listed_line, opened_line, refused_line
 
     try:
-        said = run_command.make_context("run", list(words)).params
-        if said["sequence"] is None or said["again"] is not None:
+        run = run_command.make_context("run", list(words)).params
+        if run["sequence"] is None or run["again"] is not None:
             raise UsageError("a line names its SEQUENCE, and has no --again")
-        if wrong := [name for name in _OF_THE_BATCH if said[name]]:
+        if wrong := [name for name in _OF_THE_BATCH if run[name]]:
             raise UsageError(
                 f"--{wrong[0].removeprefix('as_').replace('_', '-')} is no option of a line: give it to lslam batch"
             )
-        said["settings"] = (*said["settings"], *given["settings"])
-        said["data_root"] = said["data_root"] or given["data_root"]
-        text, folder, reading = shlex.join(words), said["out"], options.reading_of(said)
-        if said["gt"] is None and isinstance(place := as_path(said["sequence"]), RemotePath):
-            return listed_line(text, find_folder(place), resolved(said), folder, reading)
+        run["settings"] = (*run["settings"], *given["settings"])
+        run["data_root"] = run["data_root"] or given["data_root"]
+        text, folder, reading = shlex.join(words), run["out"], options.reading_of(run)
+        place = as_path(run["sequence"])
+        if run["gt"] is None and isinstance(place, RemotePath):
+            return listed_line(text, find_folder(place), resolve(run), folder, **reading)
         try:
-            sequence, config = opened_with(said)
-            return opened_line(text, sequence, config, read_truth(said["gt"], sequence), folder, reading)
+            sequence, config = open_with(run)
+            return opened_line(text, sequence, config, read_truth(run["gt"], sequence), folder, **reading)
         except InputError as error:
             # One recording of hundreds that cannot be read is a failed run, not the end of all.
-            path = as_path(said["sequence"]).expanduser().absolute()
-            return refused_line(text, path, resolved(said), folder, f"line {number}: {error}")
+            return refused_line(text, place.expanduser().absolute(), resolve(run), folder, f"line {number}: {error}")
     except LslamError as error:
         raise type(error)(f"line {number}: {error}") from None
     except click.UsageError as error:
@@ -119,35 +118,30 @@ def _line(number: int, words: list[str], given: dict[str, Any]) -> RunLine:
         raise UsageError(f"line {number}: --help is no run, give it to lslam run") from None
 
 
-def _print_plan(expanded: ExpandedStudy, as_json: bool) -> None:
+def _print_plan(study: ExpandedStudy, as_json: bool) -> None:
     if as_json:
         runs = [
             {
-                "sequence": job.sequence,
-                "method": job.method,
-                "seed": job.seed,
+                **{name: getattr(job, name) for name in ("sequence", "method", "seed")},
                 "path": str(job.path),
                 "folder": str(job.folder),
                 "refusal": job.refusal or None,
             }
-            for job in expanded.jobs
+            for job in study.jobs
         ]
-        show(json.dumps({"runs": runs}) + "\n")
+        show_json({"runs": runs})
         return
-    lines = [f"{job.name}  {job.folder}{f'  ({job.refusal})' if job.refusal else ''}\n" for job in expanded.jobs]
-    show("".join(lines))
+    show("".join(f"{job.name}  {job.folder}{f'  ({job.refusal})' if job.refusal else ''}\n" for job in study.jobs))
 
 
 def _print(rows: list[StudyRow], out: Path, as_json: bool) -> None:
-    if as_json:
-        from lslam.reports.study_table import rows_document
-
-        show(json.dumps({"folder": str(out), "results": str(out / "results.csv"), "runs": rows_document(rows)}) + "\n")
-        return
-    from lslam.reports.study_table import batch_table
+    from lslam.reports.study_table import batch_table, rows_document
     from lslam.reports.text import text_table
 
-    show(text_table(batch_table(rows), 3) + "\n")
+    if as_json:
+        show_json({"folder": str(out), "results": str(out / "results.csv"), "runs": rows_document(rows)})
+    else:
+        show(text_table(batch_table(rows), 3) + "\n")
 
 
 def _judge(rows: list[StudyRow], is_strict: bool) -> None:

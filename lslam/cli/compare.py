@@ -2,28 +2,25 @@
 
 from __future__ import annotations
 
-import json
-import shlex
 import sys
-import time
+from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import click
-from click.core import ParameterSource
 
 from lslam.cli import options
-from lslam.cli.console import log, setup_logging, show
+from lslam.cli.console import log, setup_logging, show, show_json
 
 if TYPE_CHECKING:
     from lslam.core.types.comparison import Comparison
     from lslam.core.types.trajectory import Trajectory
-    from lslam.studies.plan import Plan
+    from lslam.studies.compare import Plan
     from lslam.studies.subjects import Subject
 
 # Options that a comparison that ships with lslam does not have.
-_FIXED = ("preset", "config_file", "gt", "crop", "imu")
+_NOT_OF_READY = ("preset", "config_file", "gt", "crop", "imu")
 
 
 @click.command(
@@ -34,41 +31,27 @@ _FIXED = ("preset", "config_file", "gt", "crop", "imu")
     "          lslam compare girolimetto --quick"
 )
 @click.argument("sequences", metavar="SEQUENCE...|NAME", nargs=-1)
-@click.option("--list", "show_list", is_flag=True, help="List the comparisons that ship with lslam.")
-@click.option("--quick", is_flag=True, help="Of a comparison of --list: few drives and seeds, in minutes.")
-@click.option(
-    "--methods",
-    metavar="A,B,...",
-    help="Names of `lslam methods`, presets or configuration files; the first is the reference.",
+@options.flag("--list", "show_list", "List the comparisons that ship with lslam.")
+@options.flag("--quick", "Of a comparison of --list: few drives and seeds, in minutes.")
+@options.option(
+    "--methods", "A,B,...", "Names of `lslam methods`, presets or configuration files; the first is the reference."
 )
 @options.preset
-@click.option(
-    "--seeds",
-    metavar="N,N,...",
-    help="Seeds of simulations and of random methods, also 100-104 [default: 0, or those of NAME].",
+@options.option(
+    "--seeds", "N,N,...", "Seeds of simulations and of random methods, also 100-104 [default: 0, or those of NAME]."
 )
 @click.option(
     "--imu",
     type=click.Choice(["off", "on", "both"]),
     help="Without or with the IMU, or each method both ways, the second named icp+imu.",
 )
-@click.option("--gt", type=click.Path(path_type=Path), metavar="FILE", help="Ground truth of the one sequence.")
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    metavar="DIR",
-    help="Folder of the comparison [default: runs/compare-TIME].",
-)
-@click.option(
-    "--resume", is_flag=True, help="Keep finished runs of the same input and configuration, go on with the others."
-)
-@click.option("--overwrite", is_flag=True, help="Run everything anew in an existing folder.")
-@click.option(
-    "--jobs", type=int, default=1, show_default=True, metavar="N", help="Runs at once; with several, times mean little."
-)
+@options.path("--gt", "FILE", "Ground truth of the one sequence.")
+@options.path("--out", "DIR", "Folder of the comparison [default: runs/compare-TIME].")
+@options.resume_or_overwrite
+@options.integer("--jobs", "N", "Runs at once; with several, times mean little.", default=1, show_default=True)
 @options.scan_ranges
-@click.option("--crop", metavar="X,Y,SIZE", help="Map crop shown on the page, m; chosen by itself otherwise.")
-@click.option("--strict", is_flag=True, help="Exit 4 when any run failed.")
+@options.option("--crop", "X,Y,SIZE", "Map crop shown on the page, m; chosen by itself otherwise.")
+@options.flag("--strict", "Exit 4 when any run failed.")
 @click.option(
     "--table", type=click.Choice(["text", "md", "csv", "tex"]), default="text", help="Form; csv: a row per run."
 )
@@ -94,56 +77,43 @@ def command(sequences: tuple[str, ...], **given: Any) -> None:
         raise click.UsageError("--quick is of the comparisons of --list")
     if given["methods"] is None and not is_ready:
         raise click.UsageError("Missing option '--methods'.")
-    if is_ready:
-        _refuse_what_is_fixed(sequences[0], given)
     plan = _ready_plan(sequences[0], given) if is_ready else _plan(sequences, given)
     from lslam.cli.console import bars
     from lslam.core.errors import GateError, RunFailedError
-    from lslam.studies.compare import compare
+    from lslam.studies.compare import run_comparison
 
     with ExitStack() as stack:
-        comparison = compare(plan, bars(stack))
+        comparison = run_comparison(plan, bars(stack))
     _print(comparison, given["table"], given["as_json"])
-    log.info("the page: %s", plan.out / "compare.html")
+    log.info("the page: %s", plan.output.out / "compare.html")
     failed = comparison.failed
-    said = "; ".join(f"{run.sequence} {run.method} seed {run.seed}: {run.reason}" for run in failed[:3])
+    reasons = "; ".join(f"{run.sequence} {run.method} seed {run.seed}: {run.reason}" for run in failed[:3])
     if len(failed) == len(comparison.runs):
-        raise RunFailedError(f"{'the run' if len(failed) == 1 else f'all {len(failed)} runs'} failed: {said}")
+        raise RunFailedError(f"{'the run' if len(failed) == 1 else f'all {len(failed)} runs'} failed: {reasons}")
     if failed and given["strict"]:
-        raise GateError(f"--strict: {len(failed)} of {len(comparison.runs)} runs failed: {said}")
+        raise GateError(f"--strict: {len(failed)} of {len(comparison.runs)} runs failed: {reasons}")
 
 
 def _plan(sequences: tuple[str, ...], given: dict[str, Any]) -> Plan:
     """The comparison that the options describe. They are checked as far as possible before heavy imports."""
-    from lslam.studies.output import COMPARISON, require_free
-    from lslam.studies.plan import Plan, check_numbers
+    from lslam.studies.options import COMPARISON, check_numbers, require_free
 
     seeds, crop = options.seeds_of(given["seeds"] or "0"), _crop(given["crop"])
     check_numbers(seeds, given["jobs"], crop)
-    out = given["out"] or Path("runs") / time.strftime("compare-%Y%m%d-%H%M%S")
-    require_free(out, COMPARISON, "comparison", given["overwrite"], given["resume"])
+    output = options.output_of(given, "compare")
+    require_free(output, COMPARISON)
     from lslam.studies.variants import find_variants
 
     common, ranges = options.ranges_of(given, sequences)
-    settings = options.with_preset(given["settings"], given["preset"])
+    settings = [*options.settings_of({"odometry.preset": options.quote(given["preset"])}, given["settings"]), *common]
     methods = [name.strip() for name in given["methods"].split(",") if name.strip()]
-    variants = find_variants(methods, given["config_file"], [*settings, *common], given["imu"])
+    variants = tuple(find_variants(methods, given["config_file"], settings, given["imu"]))
     from lslam.studies.subjects import find_subjects
 
-    subjects = find_subjects(sequences, given["data_root"], ranges)
-    return Plan(
-        subjects=tuple(subjects),
-        variants=tuple(variants),
-        seeds=seeds,
-        out=out,
-        jobs=given["jobs"],
-        truth=_truth(given["gt"], subjects),
-        crop=crop,
-        overwrite=given["overwrite"],
-        resume=given["resume"],
-        data_root=given["data_root"],
-        command=shlex.join(["lslam", *sys.argv[1:]]),
-    )
+    subjects = tuple(find_subjects(sequences, given["data_root"], ranges))
+    from lslam.studies.compare import Plan
+
+    return Plan(subjects, variants, seeds, output, given["jobs"], _truth(given["gt"], subjects), crop)
 
 
 def _is_ready(word: str) -> bool:
@@ -155,55 +125,43 @@ def _is_ready(word: str) -> bool:
 def _print_list(as_json: bool) -> None:
     from lslam.studies.ready_comparison import comparison_names, find_comparison
 
-    found = {name: find_comparison(name).summary for name in comparison_names()}
+    summaries = {name: find_comparison(name).summary for name in comparison_names()}
     if as_json:
-        show(json.dumps({"comparisons": found}) + "\n")
-        return
-    show("".join(f"{name:<14}  {summary}\n" for name, summary in found.items()))
-
-
-def _refuse_what_is_fixed(name: str, given: dict[str, Any]) -> None:
-    """Raise UsageError for an option that a comparison that ships with lslam has no use for."""
-    context = click.get_current_context()
-    for option in context.command.params:
-        if option.name in _FIXED and context.get_parameter_source(option.name) is ParameterSource.COMMANDLINE:
-            raise click.UsageError(
-                f"{option.opts[0]} is not of {name}, which simulates its drives and fixes its systems: leave it out, or "
-                "compare recordings by --methods"
-            )
+        show_json({"comparisons": summaries})
+    else:
+        show("".join(f"{name:<14}  {summary}\n" for name, summary in summaries.items()))
 
 
 def _ready_plan(name: str, given: dict[str, Any]) -> Plan:
-    """A comparison that ships with lslam, in a folder of its name, in which it goes on."""
-    from lslam.studies.output import COMPARISON, require_free
-    from lslam.studies.plan import Plan, check_numbers
+    """A comparison that ships with lslam, in a folder of its name, in which it goes on.
+
+    Raises UsageError for an option that it has no use for.
+    """
+    from lslam.studies.compare import Plan
+    from lslam.studies.options import COMPARISON, OutputOptions, check_numbers, require_free
     from lslam.studies.ready_comparison import find_comparison
     from lslam.studies.subjects import find_subjects
 
+    typed = options.typed_options()
+    for option in filter(None, map(typed.get, _NOT_OF_READY)):
+        raise click.UsageError(
+            f"{option} is not of {name}, which simulates its drives and fixes its systems: leave it out, or compare "
+            "recordings by --methods"
+        )
     ready, is_quick = find_comparison(name), given["quick"]
-    source = click.get_current_context().get_parameter_source("data_root")
-    data_root = given["data_root"] if source is ParameterSource.COMMANDLINE else None
+    data_root = given["data_root"] if "data_root" in typed else None
     if data_root is not None:
         ready = ready.on_recording(data_root)
     seeds = options.seeds_of(given["seeds"]) if given["seeds"] else ready.quick.seeds if is_quick else ready.seeds
     check_numbers(seeds, given["jobs"], None)
     marks = [name, *(["recorded"] if data_root else []), *(["quick"] if is_quick else [])]
-    out = given["out"] or Path("runs") / "-".join(marks)
-    require_free(out, COMPARISON, "comparison", given["overwrite"], not given["overwrite"])
+    out, overwrite = given["out"] or Path("runs") / "-".join(marks), given["overwrite"]
+    output = OutputOptions(out, overwrite, not overwrite, None, data_root, options.command_line())
+    require_free(output, COMPARISON)
     common, ranges = options.ranges_of(given, ())
-    words = ready.quick.sequences if is_quick else ready.sequences
-    return Plan(
-        subjects=tuple(find_subjects(words, data_root, ranges)),
-        data_root=data_root,
-        variants=tuple(ready.variants([*given["settings"], *common])),
-        seeds=seeds,
-        out=out,
-        jobs=given["jobs"],
-        overwrite=given["overwrite"],
-        resume=not given["overwrite"],
-        command=shlex.join(["lslam", *sys.argv[1:]]),
-        ready=ready,
-    )
+    subjects = tuple(find_subjects(ready.quick.sequences if is_quick else ready.sequences, data_root, ranges))
+    variants = tuple(ready.variants([*given["settings"], *common]))
+    return Plan(subjects, variants, seeds, output, given["jobs"], ready=ready)
 
 
 def _crop(text: str | None) -> tuple[float, float, float] | None:
@@ -213,11 +171,11 @@ def _crop(text: str | None) -> tuple[float, float, float] | None:
     return x, y, size
 
 
-def _truth(path: Path | None, subjects: list[Subject]) -> Trajectory | None:
+def _truth(path: Path | None, subjects: Sequence[Subject]) -> Trajectory | None:
     from lslam.cli.one_run import read_truth
     from lslam.core.errors import UsageError
     from lslam.io.readers import open_sequence
-    from lslam.studies.plan import ONE_TRUTH
+    from lslam.studies.options import ONE_TRUTH
 
     if path is None:
         return None
@@ -230,7 +188,7 @@ def _print(comparison: Comparison, style: str, as_json: bool) -> None:
     from lslam.reports import compare_table
 
     if as_json:
-        show(json.dumps(compare_table.to_document(comparison), allow_nan=False) + "\n")
+        show_json(compare_table.to_document(comparison))
     elif style == "text" and sys.stdout.isatty():
         _print_rich(comparison)
     else:
@@ -248,23 +206,23 @@ def _print_rich(comparison: Comparison) -> None:
 
     console = Console()
     for table in tables(comparison, console.width):
-        shown = Table(
+        grid = Table(
             title=table.title or None, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False
         )
         for k, name in enumerate(table.header_lines):
             side: Literal["left", "right"] = "left" if k < table.names else "right"
-            shown.add_column(name, justify=side, overflow="fold", no_wrap=k == 1, vertical="bottom")
+            grid.add_column(name, justify=side, overflow="fold", no_wrap=k == 1, vertical="bottom")
         room = max((len(row[0]) for row in table.rows), default=0) - max(table.width - console.width, 0)
         for i, row in enumerate(table.rows):
             if i and row[0] != table.rows[i - 1][0] and table.header[0] == "sequence":
-                shown.add_section()
-            cells = (_shortened(row[0], max(room, 9)), *row[1:])
-            shown.add_row(*(Text(cell, "bold" if (i, k) in table.best else "") for k, cell in enumerate(cells)))
-        console.print(shown)
+                grid.add_section()
+            cells = (_shorten(row[0], max(room, 9)), *row[1:])
+            grid.add_row(*(Text(cell, "bold" if (i, k) in table.best else "") for k, cell in enumerate(cells)))
+        console.print(grid)
     for line in (*comparison.notes, *recipes(comparison)):
         console.print(Text(f"  {line}", "dim"))
 
 
-def _shortened(name: str, most: int) -> str:
+def _shorten(name: str, most: int) -> str:
     """A name with its middle left out: recordings of one day differ at the end."""
     return name if len(name) <= most else f"{name[: most // 2 - 2]}…{name[-(most // 2 + 1) :]}"

@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from lslam.cli import options
+from lslam.cli.console import show_rows
 
 
 @click.group()
@@ -22,13 +23,14 @@ def command() -> None:
 @command.command(epilog="Example: lslam config show --preset thesis-icp --set map.voxel=0.1")
 @options.preset
 @options.configuration
-@click.option("--describe", is_flag=True, help="Explain each key in a comment.")
+@options.flag("--describe", "Explain each key in a comment.")
 def show(config_file: Path | None, preset: str | None, settings: tuple[str, ...], describe: bool) -> None:
     """Print the resolved configuration as TOML."""
     from lslam.core.config import load_config, to_described_toml, to_toml
     from lslam.pipeline.check import check_config
 
-    config = load_config(config_file, options.with_preset(settings, preset))
+    flags = {"odometry.preset": options.quote(preset)}
+    config = load_config(config_file, options.settings_of(flags, settings))
     check_config(config)
     click.echo(to_described_toml(config) if describe else to_toml(config), nl=False)
 
@@ -38,10 +40,8 @@ def presets() -> None:
     """List the presets that `--preset` takes."""
     from lslam.core.config.config import known_presets
 
-    known = known_presets()
-    width = max(len(name) for name in known)
-    for name, summary in known.items():
-        click.echo(f"{name:<{width}}  {summary}")
+    summaries = known_presets()
+    show_rows(summaries.items(), max(map(len, summaries)) + 1)
 
 
 @command.command(epilog="Example: lslam config check my.toml")

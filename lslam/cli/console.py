@@ -1,19 +1,19 @@
-"""Log and progress on stderr, in colour on a terminal and as few plain lines elsewhere; results on stdout."""
+"""Log and progress on stderr, in colour on a terminal, as JSON for scripts, as few plain lines elsewhere; results on stdout."""
 
 from __future__ import annotations
 
+import json
 import logging
 import math
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from functools import cache
 from statistics import fmean, median
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
-from lslam.cli.events import Events, events
 from lslam.core.printable import lasting
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from lslam.studies.runner import StudyProgress
 
 
-class TimeLeft:
+class RemainingTime:
     """Estimate of the remaining time; `at_once` steps are made together, and one begins when another ends.
 
     A running step counts with the usual duration less its elapsed time. Steps are taken to end in the order they began, since
@@ -37,21 +37,21 @@ class TimeLeft:
     def __init__(self, total: int, at_once: int = 1, clock: Callable[[], float] | None = None) -> None:
         self.at_once = max(1, min(at_once, total))
         self._total, self._clock = total, clock or time.monotonic
-        self._done = 0
+        self._count = 0
         self._took: list[float] = []
-        self._begun = [self._clock()] * self.at_once
+        self._starts = [self._clock()] * self.at_once
 
     def step(self) -> None:
         """Record the end of a step and the start of the next, if there is one."""
         now = self._clock()
-        self._done += 1
-        if self._begun:
-            self._took.append(now - self._begun.pop(0))
-        if self._done + len(self._begun) < self._total:
-            self._begun.append(now)
+        self._count += 1
+        if self._starts:
+            self._took.append(now - self._starts.pop(0))
+        if self._count + len(self._starts) < self._total:
+            self._starts.append(now)
 
     @property
-    def _counted(self) -> list[float]:
+    def _durations(self) -> list[float]:
         return self._took[self.at_once :] or self._took
 
     @property
@@ -60,7 +60,7 @@ class TimeLeft:
 
         So a few steps that wait for something else do not count, and many that take longer than most do.
         """
-        took = self._counted
+        took = self._durations
         if not took:
             return math.nan
         parts = min(len(took), _PARTS)
@@ -73,27 +73,27 @@ class TimeLeft:
         Scans that were held back at the start come all at once: they say nothing.
 
         >>> now = [0.0]
-        >>> left = TimeLeft(5, 2, lambda: now[0])
+        >>> remaining = RemainingTime(5, 2, lambda: now[0])
         >>> now[0] = 10.0
-        >>> left.step(); left.step()
-        >>> left.seconds  # two now, and then the fifth
+        >>> remaining.step(); remaining.step()
+        >>> remaining.seconds  # two now, and then the fifth
         20.0
         """
-        if sum(self._counted) < _LEAST_S:
+        if sum(self._durations) < _LEAST_S:
             return math.nan
         now, usual = self._clock(), self.usual
-        rest = sorted(max(usual - (now - began), 0.0) for began in self._begun)
+        rest = sorted(max(usual - (now - began), 0.0) for began in self._starts)
         if not rest:
             return 0.0
-        rounds, last = divmod(self._total - self._done - len(rest), len(rest))
+        rounds, last = divmod(self._total - self._count - len(rest), len(rest))
         return rest[last - 1] + (rounds + 1) * usual if last else rest[-1] + rounds * usual
 
     @property
     def pace(self) -> str:
         """Text of the time per step, and of the number at once."""
         usual = self.usual
-        said = f"{usual:.1f} s each" + (f", {self.at_once} at once" if self.at_once > 1 else "")
-        return "" if math.isnan(usual) else said
+        text = f"{usual:.1f} s each" + (f", {self.at_once} at once" if self.at_once > 1 else "")
+        return "" if math.isnan(usual) else text
 
     @property
     def text(self) -> str:
@@ -106,6 +106,41 @@ log = logging.getLogger("lslam")
 _PARTS = 9  # of the steps that are done, for the time left
 _LEAST_S = 1.0  # of steps, before a word on the time left
 _EVERY_S = 1.0  # between two events of a stage
+
+
+class Events(logging.Handler):
+    """Handler of lslam's log for `--progress json`: a JSON object a line, in one call, so that who is killed leaves whole lines.
+
+    A record is an event of its level's name, `info`, `warning` or `error`, unless it brings another in `extra`.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._began = time.monotonic()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write the event of a record."""
+        facts = {"event": record.levelname.lower(), "text": record.getMessage(), **getattr(record, "event", {})}
+        self.tell(**facts)
+
+    def tell(self, event: str, **facts: Any) -> None:
+        """Write an event; `elapsed_s` counts from the start of the command. A pipe that is closed does not end a run."""
+        line = {"event": event, "elapsed_s": round(time.monotonic() - self._began, 3), **facts}
+        assert self.lock is not None
+        with self.lock, suppress(OSError, ValueError):
+            sys.stderr.write(json.dumps(line, default=str) + "\n")
+            sys.stderr.flush()
+
+
+def events() -> Events | None:
+    """The handler, where `--progress json` was given."""
+    first = log.handlers[0] if log.handlers else None
+    return first if isinstance(first, Events) else None
+
+
+def begin_events() -> None:
+    """Write events from now on."""
+    log.handlers[:] = [Events()]
 
 
 def setup_logging(verbose: bool = False, quiet: bool = False) -> None:
@@ -147,6 +182,16 @@ def show(text: str) -> None:
         leave_stdout()
 
 
+def show_json(document: dict[str, Any], **how: Any) -> None:
+    """Write a result to stdout as one JSON object, which has no NaN; how : as of `json.dumps`."""
+    show(json.dumps(document, allow_nan=False, **how) + "\n")
+
+
+def show_rows(rows: Iterable[tuple[str, object]], width: int = 10) -> None:
+    """Write a result to stdout as a line for each name and value; width : of the names."""
+    show("".join(f"{name:<{width}} {value}".rstrip() + "\n" for name, value in rows))
+
+
 def leave_stdout() -> None:
     """Redirect stdout to the null device after its pipe was closed, so that later writes, also at exit, do not fail."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -161,43 +206,45 @@ class Advance(Protocol):
 
 
 @contextmanager
-def progress(title: str, total: int = 0, unit: str = "scans", left: TimeLeft | None = None) -> Iterator[Advance]:
+def progress(
+    title: str, total: int = 0, unit: str = "scans", remaining: RemainingTime | None = None
+) -> Iterator[Advance]:
     """A bar with pace and time left on a terminal, events for scripts; else a plain line at most every 10 s and one at the end.
 
     total : number of steps, 0 for a stage without any, of which there is no plain line
-    left : estimate for steps that are several at once
+    remaining : estimate for steps that are several at once
     """
-    left = left or TimeLeft(total)
-    told = events()
+    remaining = remaining or RemainingTime(total)
+    to = events()
     # The first handler is that of stderr; that of log.txt follows.
     is_quiet = bool(log.handlers) and log.handlers[0].level > logging.INFO
-    if told is not None:
-        with _told(told, title, total, unit, left) as advance:
+    if to is not None:
+        with _tell_steps(to, title, total, unit, remaining) as advance:
             yield advance
     elif is_quiet:
         yield lambda note="": None
     elif sys.stderr.isatty():
-        with _bar(title, total, unit, left) as advance:
+        with _bar(title, total, unit, remaining) as advance:
             yield advance
     else:
-        yield _plain(title, total, unit, left)
+        yield _plain(title, total, unit, remaining)
 
 
-def _plain(title: str, total: int, unit: str, left: TimeLeft) -> Advance:
+def _plain(title: str, total: int, unit: str, remaining: RemainingTime) -> Advance:
     began = last = time.monotonic()
     done = 0
 
     def plain(note: str = "") -> None:
         nonlocal done, last
         done += 1
-        left.step()
+        remaining.step()
         now = time.monotonic()
         if now - last < 10 and done < total:
             return
         last = now
-        pace, end = _pace(left, unit), f"{now - began:.1f} s"
+        pace, end = _pace(remaining, unit), f"{now - began:.1f} s"
         if done < total:
-            end = "compiling" if done == 1 and unit == "scans" else left.text
+            end = "compiling" if done == 1 and unit == "scans" else remaining.text
         elif unit == "scans":
             pace = f"{done / max(now - began, 1e-9):.1f} {unit}/s"
         log.info("%s %d/%d, %s", title, done, total, ", ".join(part for part in (pace, end, note) if part))
@@ -205,13 +252,13 @@ def _plain(title: str, total: int, unit: str, left: TimeLeft) -> Advance:
     return plain
 
 
-def _pace(left: TimeLeft, unit: str) -> str:
-    is_fast = unit == "scans" and left.usual <= 1
-    return f"{1 / max(left.usual, 1e-9):.1f} {unit}/s" if is_fast else left.pace
+def _pace(remaining: RemainingTime, unit: str) -> str:
+    is_fast = unit == "scans" and remaining.usual <= 1
+    return f"{1 / max(remaining.usual, 1e-9):.1f} {unit}/s" if is_fast else remaining.pace
 
 
 @contextmanager
-def _told(to: Events, title: str, total: int, unit: str, left: TimeLeft) -> Iterator[Advance]:
+def _tell_steps(to: Events, title: str, total: int, unit: str, remaining: RemainingTime) -> Iterator[Advance]:
     """The stage as events: when it begins and ends, and at most one a second between."""
     began = last = time.monotonic()
     done = 0
@@ -224,10 +271,10 @@ def _told(to: Events, title: str, total: int, unit: str, left: TimeLeft) -> Iter
     def advance(note: str = "") -> None:
         nonlocal done, last
         done += 1
-        left.step()
+        remaining.step()
         if time.monotonic() - last >= _EVERY_S and done < total:
             last = time.monotonic()
-            seconds = left.seconds
+            seconds = remaining.seconds
             left_s = None if math.isnan(seconds) else round(seconds, 1)
             tell("progress", left_s=left_s, **({"note": note} if note else {}))
 
@@ -239,7 +286,7 @@ def _told(to: Events, title: str, total: int, unit: str, left: TimeLeft) -> Iter
 
 
 @contextmanager
-def _bar(title: str, total: int, unit: str, left: TimeLeft) -> Iterator[Advance]:
+def _bar(title: str, total: int, unit: str, remaining: RemainingTime) -> Iterator[Advance]:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn
     from rich.table import Column
     from rich.text import Text
@@ -249,7 +296,7 @@ def _bar(title: str, total: int, unit: str, left: TimeLeft) -> Iterator[Advance]
 
         def render(self, task: Task) -> Text:
             """Text of the remaining time."""
-            return Text(left.text, style="progress.remaining")
+            return Text(remaining.text, style="progress.remaining")
 
     class PaceColumn(ProgressColumn):
         """Column of the pace, cut off on a narrow terminal."""
@@ -259,13 +306,13 @@ def _bar(title: str, total: int, unit: str, left: TimeLeft) -> Iterator[Advance]
             return Text(task.fields["rate"], no_wrap=True, overflow="ellipsis")
 
     whole = Column(no_wrap=True)
-    counted = (MofNCompleteColumn(table_column=whole), LeftColumn(table_column=whole), PaceColumn()) if total else ()
-    with Progress(TextColumn("{task.description}"), BarColumn(), *counted, console=terminal(), transient=True) as bar:
+    columns = (MofNCompleteColumn(table_column=whole), LeftColumn(table_column=whole), PaceColumn()) if total else ()
+    with Progress(TextColumn("{task.description}"), BarColumn(), *columns, console=terminal(), transient=True) as bar:
         task = bar.add_task(title, total=total or None, rate="")
 
         def advance(note: str = "") -> None:
-            left.step()
-            bar.update(task, advance=1, rate=f"{_pace(left, unit)} {note}")
+            remaining.step()
+            bar.update(task, advance=1, rate=f"{_pace(remaining, unit)} {note}")
 
         yield advance
 
@@ -280,7 +327,7 @@ class Stages:
     def begin(self, title: str, total: int = 0, unit: str = "scans", at_once: int = 1) -> None:
         """Begin a stage; arguments as of `progress`, and how many steps are made at once."""
         self._bar.close()
-        self._advance = self._bar.enter_context(progress(title, total, unit, TimeLeft(total, at_once)))
+        self._advance = self._bar.enter_context(progress(title, total, unit, RemainingTime(total, at_once)))
 
     def step(self, note: str = "") -> None:
         """One step of the present stage is done."""

@@ -13,6 +13,7 @@ from lslam.cli import options
 from lslam.io.formats.trajectory_files import FORMATS
 
 if TYPE_CHECKING:
+    from lslam.core.types.gnss import Georeference
     from lslam.core.types.sequence import Calibration, Sequence
     from lslam.core.types.trajectory import Trajectory
     from lslam.maps.georeference import Projection
@@ -48,43 +49,25 @@ Examples:
     help="bag is ROS 1, mcap and sqlite are ROS 2; tum, euroc and csv are for trajectories, kitti for both; kml, gpx and gpkg "
     "for georeferenced runs  [--out's suffix].",
 )
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    metavar="PATH",
-    help="File or folder to write  [RUN/run.mcap and so on, of a run to a bag].",
-)
-@click.option("--overwrite", is_flag=True, help="Replace an existing PATH.")
-@click.option("--zstd", "is_zstd", is_flag=True, help="Compress (mcap, sqlite).")
-@click.option(
-    "--deskewed",
-    type=click.Path(path_type=Path),
-    metavar="RUN|TRAJ",
-    help="Deskew the scans by the trajectory of this run.",
-)
-@click.option("--no-clouds", is_flag=True, help="RUN to a bag: poses and map alone, without the scans.")
-@click.option("--voxel", type=float, metavar="M", help="RUN to a bag: one point of a scan per voxel of this edge.")
-@click.option(
-    "--sequence", type=click.Path(path_type=Path), metavar="PATH", help="RUN to a bag: the raw scans, when they moved."
-)
+@options.path("--out", "PATH", "File or folder to write  [RUN/run.mcap and so on, of a run to a bag].")
+@options.flag("--overwrite", "Replace an existing PATH.")
+@options.flag("--zstd", "is_zstd", "Compress (mcap, sqlite).")
+@options.path("--deskewed", "RUN|TRAJ", "Deskew the scans by the trajectory of this run.")
+@options.flag("--no-clouds", "RUN to a bag: poses and map alone, without the scans.")
+@options.real("--voxel", "M", "RUN to a bag: one point of a scan per voxel of this edge.")
+@options.path("--sequence", "PATH", "RUN to a bag: the raw scans, when they moved.")
 @click.option(
     "--lidars",
     type=click.Choice(["merged", "topics", "frames"]),
     help="Several LiDARs to a bag: each on a topic of its own, or all on one  [merged into one].",
 )
 @options.scan_range
-@click.option(
-    "--frame", metavar="BODY", help="Trajectory: lidar, cam0 or imu [default: what the format usually holds]."
-)
-@click.option(
-    "--from-frame", metavar="BODY", help="Trajectory: body of SOURCE's poses, where the file does not name it."
-)
-@click.option(
-    "--crs", metavar="EPSG:N[+M]", help="csv and gpkg of a georeferenced run: coordinates  [those of its map]."
-)
-@click.option("--geoid", metavar="GRID", help="csv and gpkg: heights above this geoid (.gtx, .tif).")
-@click.option("--calib", type=click.Path(path_type=Path), metavar="FILE", help="Trajectory: KITTI calibration with Tr.")
-@click.option("--times", type=click.Path(path_type=Path), metavar="FILE", help="Trajectory: stamps of a KITTI file.")
+@options.option("--frame", "BODY", "Trajectory: lidar, cam0 or imu [default: what the format usually holds].")
+@options.option("--from-frame", "BODY", "Trajectory: body of SOURCE's poses, where the file does not name it.")
+@options.option("--crs", "EPSG:N[+M]", "csv and gpkg of a georeferenced run: coordinates  [those of its map].")
+@options.option("--geoid", "GRID", "csv and gpkg: heights above this geoid (.gtx, .tif).")
+@options.path("--calib", "FILE", "Trajectory: KITTI calibration with Tr.")
+@options.path("--times", "FILE", "Trajectory: stamps of a KITTI file.")
 @options.reading
 @options.data_root
 @options.as_json
@@ -101,14 +84,11 @@ def command(source: str, kind: str | None, out: Path | None, **given: Any) -> No
     kind = kind or BY_SUFFIX.get("" if out is None else out.suffix.lower())
     if kind is None:
         raise click.UsageError(f"--to says what to write; an --out whose name ends in {', '.join(BY_SUFFIX)} does too")
-    is_run = kind in BAGS and (Path(source).expanduser() / "trajectory.tum").is_file()
-    if is_run:
-        _refuse(
-            given,
-            (*NOT_OF_RUNS, "crs", "geoid"),
-            f"is not for the folder of a run to {kind}: all its scans are written as they lie",
-        )
-        _convert_run(Path(source).expanduser(), kind, out, given)
+    path = Path(source).expanduser()
+    if kind in BAGS and (path / "trajectory.tum").is_file():
+        why = f"is not for the folder of a run to {kind}: all its scans are written as they lie"
+        _refuse(given, (*NOT_OF_RUNS, "crs", "geoid"), why)
+        _convert_run(path, kind, out, given)
         return
     _refuse(given, OF_RUNS, "is for the folder of a run to bag, mcap or sqlite")
     if kind not in IN_CRS:
@@ -117,8 +97,9 @@ def command(source: str, kind: str | None, out: Path | None, **given: Any) -> No
         raise click.UsageError("--out names the file or folder to write")
     if kind == "gpkg":
         _refuse(given, (*NOT_OF_RUNS, "is_zstd"), "is not for --to gpkg, which has the poses of a run as they lie")
-        _convert_to_gpkg(Path(source).expanduser(), out, given)
-    elif kind not in SEQUENCES or _is_trajectory(source):
+        _convert_to_gpkg(path, out, given)
+    elif kind not in SEQUENCES or _is_trajectory(path):
+        _refuse(given, ("is_zstd", "deskewed"), f"is for sequences, and {source} to {kind} is a trajectory")
         _convert_trajectory(source, kind, out, given)
     else:
         _convert_sequence(source, kind, out, given)
@@ -131,11 +112,10 @@ def _refuse(given: dict[str, Any], names: tuple[str, ...], why: str) -> None:
             raise click.UsageError(f"--{name.removeprefix('is_').replace('_', '-')} {why}")
 
 
-def _is_trajectory(source: str) -> bool:
-    """Whether `source` is a run folder, or a file that is no bag."""
+def _is_trajectory(path: Path) -> bool:
+    """Whether `path` is a run folder, or a file that is no bag."""
     from lslam.io.formats.bag_listing import list_bag_files
 
-    path = Path(source).expanduser()
     return (path / "trajectory.tum").is_file() or (path.is_file() and not list_bag_files(path))
 
 
@@ -152,9 +132,7 @@ def _open(source: str, given: dict[str, Any]) -> Sequence:
 
 
 def _convert_sequence(source: str, kind: str, out: Path, given: dict[str, Any]) -> None:
-    import logging
-
-    from lslam.cli.console import progress
+    from lslam.cli.console import log, progress
     from lslam.pipeline.convert import check_output
 
     check_output(kind, out, given["is_zstd"], given["overwrite"])
@@ -163,7 +141,6 @@ def _convert_sequence(source: str, kind: str, out: Path, given: dict[str, Any]) 
     from lslam.io.formats.trajectory_files import read_trajectory
     from lslam.pipeline.convert.convert_sequence import convert_sequence
 
-    log = logging.getLogger("lslam")
     for note in sequence.notes:
         log.info("%s", note)
     for problem in sequence.problems:
@@ -172,7 +149,7 @@ def _convert_sequence(source: str, kind: str, out: Path, given: dict[str, Any]) 
     if trajectory is not None and not trajectory.has_rotations:
         raise click.UsageError(f"--deskewed {given['deskewed']}: positions without rotations deskew no scan")
     with progress("convert", len(sequence)) as advance:
-        done = convert_sequence(
+        count = convert_sequence(
             sequence,
             kind,
             out,
@@ -182,9 +159,9 @@ def _convert_sequence(source: str, kind: str, out: Path, given: dict[str, Any]) 
             lidars=given["lidars"] or "merged",
             on_scan=advance,
         )
-    left = f", {done.skipped} that could not be read left out" if done.skipped else ""
-    values = {"scans": done.scans, "skipped": done.skipped}
-    _print(f"{done.path}: {done.scans} scans{left}", done.path, kind, values, given)
+    without = f", {count.unreadable} that could not be read left out" if count.unreadable else ""
+    values = {"scans": count.scans, "skipped": count.unreadable}
+    _print(f"{out}: {count.scans} scans{without}", out, kind, values, given)
 
 
 def _convert_run(folder: Path, kind: str, out: Path | None, given: dict[str, Any]) -> None:
@@ -206,7 +183,7 @@ def _convert_run(folder: Path, kind: str, out: Path | None, given: dict[str, Any
         flag = "--sequence, or leave them out with --no-clouds"
         scans = open_scans(run, given["sequence"], flag=flag, **options.reading_of(given))
     with progress("convert", len(run.trajectory)) as advance:
-        done = convert_run(
+        count = convert_run(
             run,
             scans,
             kind,
@@ -216,9 +193,8 @@ def _convert_run(folder: Path, kind: str, out: Path | None, given: dict[str, Any
             overwrite=given["overwrite"],
             on_scan=advance,
         )
-    text = f"{done.path}: {done.poses} poses, {done.clouds} clouds, a map of {done.map_points} points"
-    values = {"poses": done.poses, "clouds": done.clouds, "map_points": done.map_points}
-    _print(text, done.path, kind, values, given)
+    text = f"{out}: {count.poses} poses, {count.clouds} clouds, a map of {count.map_points} points"
+    _print(text, out, kind, vars(count), given)
 
 
 def _print(text: str, path: Path, kind: str, values: dict[str, Any], given: dict[str, Any]) -> None:
@@ -232,47 +208,36 @@ def _convert_to_gpkg(folder: Path, out: Path, given: dict[str, Any]) -> None:
     from lslam.pipeline.convert.to_gpkg import convert_to_gpkg
 
     options.require_there(folder)
-    done = convert_to_gpkg(folder, out, crs=options.output_crs(given), overwrite=given["overwrite"])
-    text = f"{out}: {', '.join(f'{len(layer.features)} in {layer.name}' for layer in done)}"
-    _print(text, out, "gpkg", {"features": {layer.name: len(layer.features) for layer in done}}, given)
+    layers = convert_to_gpkg(folder, out, crs=options.output_crs(given), overwrite=given["overwrite"])
+    text = f"{out}: {', '.join(f'{len(layer.features)} in {layer.name}' for layer in layers)}"
+    _print(text, out, "gpkg", {"features": {layer.name: len(layer.features) for layer in layers}}, given)
 
 
 def _convert_trajectory(source: str, kind: str, out: Path, given: dict[str, Any]) -> None:
-    for flag, name in (("--zstd", "is_zstd"), ("--deskewed", "deskewed")):
-        if given[name]:
-            raise click.UsageError(f"{flag} is for sequences, and {source} to {kind} is a trajectory")
-    from lslam.pipeline.convert.convert_trajectory import convert_trajectory
+    from lslam.maps.georeference import Projection
+    from lslam.pipeline.convert.convert_trajectory import convert_trajectory, georeference_beside
 
-    where = ""
-    how = {"frame": given["frame"], "overwrite": given["overwrite"]}
+    path = Path(source).expanduser()
+    place: Georeference | Projection | None = _projection(path, given) if kind == "csv" else None
     if kind in EARTH:
-        from lslam.pipeline.convert.convert_trajectory import convert_to_earth, georeference_beside
-
         options.require_there(Path(source))
-        georeference = georeference_beside(Path(source).expanduser(), f"--to {kind}")
-        trajectory, calibration = _read_trajectory(source, kind, given)
-        moved = convert_to_earth(trajectory, kind, out, georeference, calibration, **how)
-    elif (projection := _projection(Path(source).expanduser(), given) if kind == "csv" else None) is not None:
-        from lslam.pipeline.convert.convert_trajectory import convert_to_crs
-
-        trajectory, calibration = _read_trajectory(source, kind, given)
-        moved = convert_to_crs(trajectory, out, projection, calibration, **how)
-        where = f" in {projection.name}"
-    else:
-        trajectory, calibration = _read_trajectory(source, kind, given)
-        moved = convert_trajectory(trajectory, kind, out, calibration, **how)
-    text = f"{out}: {len(moved)} poses of {moved.frame}{where}"
-    _print(text, out, kind, {"poses": len(moved), "frame": moved.frame}, given)
+        place = georeference_beside(path, f"--to {kind}")
+    trajectory, calibration = _read_trajectory(source, kind, given)
+    how = {"frame": given["frame"], "overwrite": given["overwrite"]}
+    result = convert_trajectory(trajectory, kind, out, calibration, place=place, **how)
+    where = f" in {place.name}" if isinstance(place, Projection) else ""
+    text = f"{out}: {len(result)} poses of {result.frame}{where}"
+    _print(text, out, kind, {"poses": len(result), "frame": result.frame}, given)
 
 
 def _projection(source: Path, given: dict[str, Any]) -> Projection | None:
     """Coordinates of the map of a georeferenced run, or those that are asked for; None of a trajectory that lies nowhere."""
     from lslam.maps.georeference import Projection, in_crs
-    from lslam.pipeline.convert.convert_trajectory import georeference_beside, known_georeference
+    from lslam.pipeline.convert.convert_trajectory import find_georeference, georeference_beside
 
     crs = options.output_crs(given)
     if crs is None:
-        georeference = known_georeference(source)
+        georeference = find_georeference(source)
     else:
         options.require_there(source)
         georeference = in_crs(georeference_beside(source, "--geoid" if crs.epsg is None else "--crs"), crs)
@@ -286,8 +251,9 @@ def _read_trajectory(source: str, kind: str, given: dict[str, Any]) -> tuple[Tra
     from lslam.io.formats.kitti_layout import read_cam0_lidar, read_transform
     from lslam.io.formats.trajectory_files import read_trajectory
 
-    if _is_trajectory(source):
-        trajectory = read_trajectory(Path(source).expanduser(), times=given["times"])
+    path = Path(source).expanduser()
+    if _is_trajectory(path):
+        trajectory = read_trajectory(path, times=given["times"])
         calibration = Calibration()
     else:
         sequence = _open(source, given)

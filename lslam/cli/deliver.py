@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import json
-import shlex
-import sys
 from pathlib import Path
 from typing import Any
 
 import click
 
 from lslam.cli import options
-from lslam.cli.console import progress, setup_logging, show
+from lslam.cli.console import progress, setup_logging, show_json, show_rows
 
 EPILOG = """\b
 Examples:
@@ -23,17 +20,12 @@ Examples:
 
 @click.command(epilog=EPILOG)
 @click.argument("run", metavar="RUN", type=click.Path(path_type=Path))
-@click.option("--out", type=click.Path(path_type=Path), metavar="FOLDER", required=True, help="Folder to write.")
-@click.option("--crs", metavar="EPSG:N[+M]", help="Coordinates, +M of heights  [as the run].")
-@click.option("--geoid", metavar="GRID", help="Heights above this geoid (.gtx, .tif)  [as the run].")
-@click.option(
-    "--check",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="CSV of surveyed points that the run did not use, as --control has them.",
-)
-@click.option("--anyway", is_flag=True, help="Deliver a run that diverged or was interrupted, too, and say so in it.")
-@click.option("--overwrite", is_flag=True, help="Replace an earlier delivery.")
+@options.path("--out", "FOLDER", "Folder to write.", required=True)
+@options.option("--crs", "EPSG:N[+M]", "Coordinates, +M of heights  [as the run].")
+@options.option("--geoid", "GRID", "Heights above this geoid (.gtx, .tif)  [as the run].")
+@options.path("--check", "FILE", "CSV of surveyed points that the run did not use, as --control has them.")
+@options.flag("--anyway", "Deliver a run that diverged or was interrupted, too, and say so in it.")
+@options.flag("--overwrite", "Replace an earlier delivery.")
 @options.as_json
 @options.verbosity
 def command(run: Path, **given: Any) -> None:
@@ -50,23 +42,22 @@ def command(run: Path, **given: Any) -> None:
 
     check_delivery(run, given["out"], given["overwrite"])
     survey = read_survey(run, crs, given["check"], given["anyway"])
-    words = shlex.join(["lslam", *sys.argv[1:]])
     with progress("deliver", STEPS, "parts") as advance:
-        made = deliver(survey, given["out"], overwrite=given["overwrite"], command=words, on_step=advance)
+        command = options.command_line()
+        delivery = deliver(survey, given["out"], overwrite=given["overwrite"], command=command, on_step=advance)
     if given["as_json"]:
         document = {
-            "folder": str(made.folder),
+            "folder": str(delivery.folder),
             "frame": survey.frame.frame,
             "crs": None if survey.frame.epsg is None else survey.frame.name,
             "status": survey.status,
-            "files": dict(made.files),
+            "files": dict(delivery.files),
             "points": {p.kind: {"count": len(p.names), "rms_m": p.rms, "largest_m": p.worst} for p in survey.points},
-            "accuracy": made.accuracy,
-            "notes": made.notes,
+            "accuracy": delivery.accuracy,
+            "notes": delivery.notes,
         }
-        show(json.dumps(document) + "\n")
+        show_json(document)
         return
-    rows = [("delivered", str(made.folder)), ("coordinates", survey.frame.frame), ("status", survey.status)]
-    rows += [*made.files.items(), *(("accuracy" if k == 0 else "", said) for k, said in enumerate(made.accuracy))]
-    rows += [("note", said) for said in made.notes]
-    show("".join(f"{name:<14} {text}\n" for name, text in rows))
+    rows = [("delivered", str(delivery.folder)), ("coordinates", survey.frame.frame), ("status", survey.status)]
+    rows += [*delivery.files.items(), *(("" if k else "accuracy", text) for k, text in enumerate(delivery.accuracy))]
+    show_rows([*rows, *(("note", text) for text in delivery.notes)], 14)

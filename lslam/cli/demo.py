@@ -18,15 +18,9 @@ SCENARIO, LIDAR, SCANS = "block", "vlp16", 95
 
 
 @click.command(epilog="\b\nExamples: lslam demo\n          lslam demo --no-open --out tour")
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    default=Path("lslam-demo"),
-    metavar="DIR",
-    help="Folder of recording and run [default: lslam-demo].",
-)
-@click.option("--no-open", is_flag=True, help="Do not open the page in a browser.")
-@click.option("--overwrite", is_flag=True, help="Replace an earlier demo in the folder.")
+@options.path("--out", "DIR", "Folder of recording and run [default: lslam-demo].", default=Path("lslam-demo"))
+@options.flag("--no-open", "Do not open the page in a browser.")
+@options.flag("--overwrite", "Replace an earlier demo in the folder.")
 @options.as_json
 @options.verbosity
 def command(out: Path, no_open: bool, **given: Any) -> None:
@@ -37,14 +31,14 @@ def command(out: Path, no_open: bool, **given: Any) -> None:
     setup_logging(given["verbose"], given["quiet"])
     recording, folder = out / "recording", out / "run"
     from lslam.core.config import Config
-    from lslam.pipeline.precompile import helped, start_helper
+    from lslam.pipeline.precompile import helper_process, start_helper
     from lslam.pipeline.run_folder import check_target
     from lslam.simulation import check_target as check_recording
 
     check_recording(recording, given["overwrite"], False)
     check_target(folder, given["overwrite"])
     context = click.get_current_context()
-    with helped():
+    with helper_process():
         # Rays are cast on one core: the other one compiles what the run needs.
         start_helper(Config(), if_cold=True)
         with progress("opening"):
@@ -57,10 +51,10 @@ def command(out: Path, no_open: bool, **given: Any) -> None:
         log.info("%s", simulating.record_drive(drive, recording, given["overwrite"]).text)
         context.invoke(main_job.command, sequence=str(recording), out=folder, lidar_topic=None, **given)
     page = folder / "report.html"
-    is_shown = not no_open and open_page(page)
+    is_open = not no_open and open_page(page)
     if given["as_json"]:
         return
-    where = "is open in your browser" if is_shown else "is to be opened in a browser"
+    where = "is open in your browser" if is_open else "is to be opened in a browser"
     show(f"\nThe page {where}: {page.absolute()}\n\nTo go on:\n")
     for words in (
         ("info", recording),

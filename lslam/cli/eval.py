@@ -31,41 +31,28 @@ Examples:
 @click.command(epilog=EPILOG)
 @click.argument("estimates", metavar="EST...", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.argument("truth", metavar="GT", type=click.Path(path_type=Path))
-@click.option(
-    "--align", multiple=True, metavar="A[,A]", help="ATE alignments: none, origin, se3, sim3, posyaw  [se3,origin]."
+@options.option("--align", "A[,A]", "ATE alignments: none, origin, se3, sim3, posyaw  [se3,origin].", multiple=True)
+@options.option(
+    "--delta", "D", "RPE distance: 1scan, 10m, 2s, with /consecutive or /all  [1scan, 10m/all].", multiple=True
 )
-@click.option(
-    "--delta",
-    multiple=True,
-    metavar="D",
-    help="RPE distance: 1scan, 10m, 2s, with /consecutive or /all  [1scan, 10m/all].",
-)
-@click.option("--max-diff", type=float, metavar="S", help="Largest difference of stamps in a pair  [0.01].")
-@click.option(
-    "--time-offset", metavar="S|auto", help="Seconds added to the estimate's stamps, or found by correlating motion."
-)
-@click.option(
-    "--T-est-gt", "transform", metavar="T", help="Truth's body in the estimate's: 12, 16 or 7 numbers, or a file."
-)
-@click.option(
-    "--calib", type=click.Path(path_type=Path), metavar="FILE", help="KITTI calibration or sequence.toml: extrinsics."
-)
-@click.option("--frame", metavar="NAME", help="Score the poses of another frame of the robot, as base_link  [lidar].")
-@click.option("--times", type=click.Path(path_type=Path), metavar="FILE", help="Stamps of KITTI files, one per line.")
+@options.real("--max-diff", "S", "Largest difference of stamps in a pair  [0.01].")
+@options.option("--time-offset", "S|auto", "Seconds added to the estimate's stamps, or found by correlating motion.")
+@options.option("--T-est-gt", "transform", "T", "Truth's body in the estimate's: 12, 16 or 7 numbers, or a file.")
+@options.path("--calib", "FILE", "KITTI calibration or sequence.toml: extrinsics.")
+@options.option("--frame", "NAME", "Score the poses of another frame of the robot, as base_link  [lidar].")
+@options.path("--times", "FILE", "Stamps of KITTI files, one per line.")
 @click.option(
     "--format", "file_format", type=click.Choice(list(FORMATS)), help="Format of the estimates; detected by default."
 )
 @click.option("--gt-format", type=click.Choice(list(FORMATS)), help="Format of the ground truth; detected by default.")
-@click.option(
-    "--timing", "timing_file", type=click.Path(path_type=Path), metavar="CSV", help="timing.csv of the one estimate."
-)
+@options.path("--timing", "timing_file", "CSV", "timing.csv of the one estimate.")
 @options.metrics
 @options.as_json
 @click.option("--table", type=click.Choice(["text", "md", "csv", "tex"]), default="text", help="Style of the table.")
-@click.option("--plot", type=click.Path(path_type=Path), metavar="FILE", help="Draw a .png, .svg or .pdf.")
-@click.option("--fail-ate", type=float, metavar="M", help="Exit 4 when the first ATE's rmse is larger.")
-@click.option("--fail-rpe", type=float, metavar="M", help="Exit 4 when the first RPE's translational rmse is larger.")
-@click.option("--fail-drift", type=float, metavar="PERCENT", help="Exit 4 when the KITTI drift is larger.")
+@options.path("--plot", "FILE", "Draw a .png, .svg or .pdf.")
+@options.real("--fail-ate", "M", "Exit 4 when the first ATE's rmse is larger.")
+@options.real("--fail-rpe", "M", "Exit 4 when the first RPE's translational rmse is larger.")
+@options.real("--fail-drift", "PERCENT", "Exit 4 when the KITTI drift is larger.")
 @options.configuration
 @options.verbosity
 def command(
@@ -155,8 +142,8 @@ def _evaluate_all(
     evaluations = []
     for path in estimates:
         if config.frame not in calibration.poses_in_lidar() and given["calib"] is None and path.is_dir():
+            from lslam.pipeline.again import open_again
             from lslam.pipeline.rebuild import read_run
-            from lslam.pipeline.resume import open_again
 
             calibration = open_again(read_run(path)).calibration
         estimate: Trajectory = read_trajectory(path, given["file_format"], given["times"])
@@ -181,20 +168,20 @@ def _calibration(truth: Path, calib: Path | None) -> Calibration:
         return Calibration(T_cam0_lidar=kitti_layout.read_cam0_lidar(calib))
     above = truth.resolve().parent
     for folder in (above, above.parent / "sequences" / truth.stem):
-        tr, said = folder / "calib.txt", folder / FILE_NAME
-        if tr.is_file() or said.is_file():
+        tr, toml = folder / "calib.txt", folder / FILE_NAME
+        if tr.is_file() or toml.is_file():
             T_cam0_lidar = kitti_layout.read_odometry_calib(tr) if tr.is_file() else None
-            info = read_sequence_toml(said) if said.is_file() else SequenceInfo()
+            info = read_sequence_toml(toml) if toml.is_file() else SequenceInfo()
             return calibration_over(info, Calibration(T_cam0_lidar))
     return Calibration()
 
 
-def _timing(estimate: Path, given: Path | None) -> Timing | None:
+def _timing(estimate: Path, file: Path | None) -> Timing | None:
     """The timing of --timing, or of timing.csv beside the estimate; None without one."""
     from lslam.evaluation.timing import read_timing
 
-    if given is not None:
-        return read_timing(given)
+    if file is not None:
+        return read_timing(file)
     beside = (estimate if estimate.is_dir() else estimate.parent) / "timing.csv"
     return read_timing(beside) if beside.is_file() else None
 
@@ -204,7 +191,7 @@ def _hold_gates(evaluations: list[Evaluation], given: dict[str, Any]) -> None:
     from lslam.core.errors import GateError
     from lslam.evaluation.evaluate import METRICS
 
-    broken = []
+    failures = []
     for e in evaluations:
         for metric in METRICS:
             gate = given.get(f"fail_{metric.gate_option}")
@@ -213,6 +200,8 @@ def _hold_gates(evaluations: list[Evaluation], given: dict[str, Any]) -> None:
             name, value, unit = metric.gate_value(e)
             if value is None or not value <= gate:
                 number = "n/a" if value is None else f"{value:.4g} {unit}"
-                broken.append(f"{name} of {e.estimate} is {number}, --fail-{metric.gate_option} allows {gate:g} {unit}")
-    if broken:
-        raise GateError("; ".join(broken))
+                failures.append(
+                    f"{name} of {e.estimate} is {number}, --fail-{metric.gate_option} allows {gate:g} {unit}"
+                )
+    if failures:
+        raise GateError("; ".join(failures))

@@ -9,8 +9,9 @@ from typing import Any
 import click
 
 from lslam.cli import options
+from lslam.cli.console import show, show_json, show_rows
 
-_SHOWN = 8  # names of files
+_MOST_FILES = 8  # named
 
 
 def bag_lines(bag: dict[str, Any]) -> Iterator[tuple[str, str]]:
@@ -23,7 +24,7 @@ def bag_lines(bag: dict[str, Any]) -> Iterator[tuple[str, str]]:
     yield "bag", ", ".join(parts)
     if files > 1:
         names = [PurePath(file).name for file in bag["files"]]
-        yield "parts", ", ".join(names if files <= _SHOWN else [*names[: _SHOWN - 2], "...", names[-1]])
+        yield "parts", ", ".join(names if files <= _MOST_FILES else [*names[: _MOST_FILES - 2], "...", names[-1]])
 
 
 def topic_lines(bag: dict[str, Any]) -> Iterator[str]:
@@ -57,111 +58,82 @@ def _size(count: int) -> str:
 
 @click.command(epilog="\b\nExamples: lslam info sample_data\n          lslam info --machine")
 @click.argument("sequence", required=False)
-@click.option(
-    "--machine", is_flag=True, help="Show what this machine has instead: cores, memory, kernels, grids, extras."
-)
+@options.flag("--machine", "Show what this machine has instead: cores, memory, kernels, grids, extras.")
 @options.data_root
-@click.option(
+@options.option(
     "--scans",
+    "N",
+    "Number of scans whose points are examined, spread evenly.",
     type=click.IntRange(min=1),
     default=50,
     show_default=True,
-    metavar="N",
-    help="Number of scans whose points are examined, spread evenly.",
 )
-@click.option("--all", "all_scans", is_flag=True, help="Examine the points of every scan.")
-@click.option("--rows", type=int, metavar="N", help="Organised clouds: rows (rings).")
-@click.option("--cols", type=int, metavar="N", help="Organised clouds: columns.")
-@click.option(
-    "--quick",
-    is_flag=True,
-    help="Register no scans: the IMU's clock and axes, and the order of the points, are not checked.",
-)
-@click.option(
-    "--cameras", "with_cameras", is_flag=True, help="Compare edges of the images with edges of depth: pixels and time."
-)
-@click.option(
+@options.flag("--all", "all_scans", "Examine the points of every scan.")
+@options.integer("--rows", "N", "Organised clouds: rows (rings).")
+@options.integer("--cols", "N", "Organised clouds: columns.")
+@options.flag("--quick", "Register no scans: the IMU's clock and axes, and the order of the points, are not checked.")
+@options.flag("--cameras", "with_cameras", "Compare edges of the images with edges of depth: pixels and time.")
+@options.option(
     "--imu-toml",
+    "FILE",
+    "Write the IMU's noise as a configuration for --config.",
     type=click.Path(path_type=Path, dir_okay=False),
-    metavar="FILE",
-    help="Write the IMU's noise as a configuration for --config.",
 )
 @options.reading
 @options.as_json
-def command(
-    sequence: str | None,
-    machine: bool,
-    data_root: Path | None,
-    scans: int,
-    all_scans: bool,
-    rows: int | None,
-    cols: int | None,
-    quick: bool,
-    with_cameras: bool,
-    imu_toml: Path | None,
-    as_json: bool,
-    **given: Any,
-) -> None:
+def command(sequence: str | None, as_json: bool, imu_toml: Path | None, **given: Any) -> None:
     """Show the contents and the faults of SEQUENCE: a folder, a bag, or a name under the data root.
 
     Of a bag all topics are listed, also where none has clouds. Each finding comes with advice.
     The first scans are registered, to compare their rotations with the IMU's.
     """
-    if machine or sequence is None:
-        _show_machine(sequence, machine, as_json)
+    if given["machine"] or sequence is None:
+        _show_machine(sequence, given["machine"], as_json)
         return
     from lslam.core.errors import LslamError, OutputExistsError
     from lslam.io.readers import open_sequence
 
     if imu_toml is not None and imu_toml.exists():
         raise OutputExistsError(f"{imu_toml} exists already: name another file with --imu-toml")
+    data_root = given["data_root"]
+    reading = {**options.reading_of(given), "rows": given["rows"], "cols": given["cols"]}
     try:
-        opened = open_sequence(sequence, data_root=data_root, rows=rows, cols=cols, **options.reading_of(given))
+        recording = open_sequence(sequence, data_root=data_root, **reading)
     except LslamError as error:
         _show_bag(sequence, data_root, str(error) if as_json else None)
         raise
     from lslam.pipeline.doctor.inspect import inspect
 
-    facts = inspect(opened, None if all_scans else scans, quick, with_cameras)
+    facts = inspect(recording, None if given["all_scans"] else given["scans"], given["quick"], given["with_cameras"])
     if imu_toml is not None:
         _write_noise(imu_toml, facts)
     if as_json:
-        import json
-
-        click.echo(json.dumps(facts, indent=1, allow_nan=False))
+        show_json(facts, indent=1)
         return
-    for label, value in _lines(facts):
-        click.echo(f"{label:<18} {value}".rstrip())
+    show_rows(_lines(facts), 18)
     if facts["bag"] is not None:
         _show_topics(facts["bag"])
     for title, key in (("notes", "notes"), ("findings", "problems")):
         if facts[key]:
-            click.echo(f"\n{title}")
-            for sentence in facts[key]:
-                click.echo(f"  - {sentence}")
+            show(f"\n{title}\n" + "".join(f"  - {sentence}\n" for sentence in facts[key]))
     if not facts["problems"]:
-        click.echo("\nnothing wrong found")
+        show("\nnothing wrong found\n")
 
 
 def _show_machine(sequence: str | None, machine: bool, as_json: bool) -> None:
     if sequence is not None or not machine:
         raise click.UsageError("SEQUENCE or --machine says what is looked at: give one of them")
-    from lslam.cli.machine import machine_document, machine_lines
+    from lslam.cli.machine import machine_document, machine_rows
 
     document = machine_document()
     if as_json:
-        import json
-
-        click.echo(json.dumps(document, indent=1, allow_nan=False))
+        show_json(document, indent=1)
     else:
-        click.echo("\n".join(machine_lines(document)))
+        show_rows(machine_rows(document))
 
 
 def _show_topics(bag: dict[str, Any]) -> None:
-
-    click.echo("\ntopics")
-    for line in topic_lines(bag):
-        click.echo(f"  {line}")
+    show("\ntopics\n" + "".join(f"  {line}\n" for line in topic_lines(bag)))
 
 
 def _show_bag(name: str, data_root: Path | None, error: str | None) -> None:
@@ -179,14 +151,10 @@ def _show_bag(name: str, data_root: Path | None, error: str | None) -> None:
     if bag is None:
         return
     if error is not None:
-        import json
-
-        click.echo(json.dumps({"path": name, "bag": bag, "error": error}, indent=1, allow_nan=False))
+        show_json({"path": name, "bag": bag, "error": error}, indent=1)
         return
-    for label, value in bag_lines(bag):
-        click.echo(f"{label:<18} {value}")
-    for sentence in bag["remarks"]:
-        click.echo(f"  - {sentence}")
+    show_rows(bag_lines(bag), 18)
+    show("".join(f"  - {sentence}\n" for sentence in bag["remarks"]))
     _show_topics(bag)
 
 
@@ -198,12 +166,8 @@ def _lines(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
         yield from bag_lines(facts["bag"])
     yield "scans", f"{facts['scans']} in {time['duration_s']:.2f} s, {time['rate_hz']:g} Hz"
     if time["period_s"]:
-        period = time["period_s"]
-        gaps = len(time["gaps"])
-        yield (
-            "period",
-            f"{_ms(period['min'])} .. {_ms(period['median'])} .. {_ms(period['max'])} ms, {gaps or 'no'} gaps",
-        )
+        low, middle, high = (f"{1e3 * time['period_s'][name]:.1f}" for name in ("min", "median", "max"))
+        yield "period", f"{low} .. {middle} .. {high} ms, {len(time['gaps']) or 'no'} gaps"
     yield "scans looked at", _looked_at(points)
     if points["count"]:
         count = points["count"]
@@ -219,11 +183,10 @@ def _lines(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
         yield "elevation", f"{low:.1f} .. {high:.1f} deg (98 % of the points)"
     yield "intensity", _limits(points["intensity"], "")
     yield "per-point times", _limits(points["per_point_times"], " s from the scan's stamp")
-    reconstructed = points["rings"] is None and facts["rings_rule"]
-    yield "rings", f"by {facts['rings_rule']}" if reconstructed else _limits(points["rings"], "")
+    by_rule = points["rings"] is None and facts["rings_rule"]
+    yield "rings", f"by {facts['rings_rule']}" if by_rule else _limits(points["rings"], "")
     yield "compensated", {True: "yes", False: "no", None: "unknown"}[facts["motion_compensated"]]
-    known = [key for key, T in facts["extrinsics"].items() if T is not None]
-    yield "extrinsics", ", ".join(known) or "none"
+    yield "extrinsics", ", ".join(key for key, T in facts["extrinsics"].items() if T is not None) or "none"
     yield "IMU", _imu(facts["imu"])
     if facts["imu"]:
         yield "IMU noise", _noise(facts["imu"]["noise"])
@@ -244,10 +207,6 @@ def _looked_at(points: dict[str, Any]) -> str:
         if points[key]
     ]
     return f"{points['scans_read'] + points['scans_unreadable']}" + (f" ({', '.join(extra)})" if extra else "")
-
-
-def _ms(seconds: float) -> str:
-    return f"{seconds * 1e3:.1f}"
 
 
 def _limits(limits: list[float] | None, unit: str) -> str:

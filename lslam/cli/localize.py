@@ -18,39 +18,31 @@ from lslam.cli import run as main_job
     "          lslam localize tuesday.bag --map runs/monday --gnss --method fast-lio2 --json"
 )
 @click.argument("sequence")
-@click.option(
-    "--map",
-    "map_path",
-    type=click.Path(path_type=Path),
-    metavar="MAP",
-    required=True,
-    help="Run folder, folder of tiles, or a cloud: PLY, PCD, LAS or LAZ.",
+@options.path(
+    "--map", "map_path", "MAP", "Run folder, folder of tiles, or a cloud: PLY, PCD, LAS or LAZ.", required=True
 )
-@click.option(
+@options.option(
     "--start",
-    metavar="X,Y,HEADING",
-    help="Place of the first scan in the map, m, and heading, deg counter-clockwise from its x axis [default: searched].",
+    "X,Y,HEADING",
+    "Place of the first scan in the map, m, and heading, deg counter-clockwise from its x axis [default: searched].",
 )
-@click.option("--gnss", is_flag=True, help="Search the start about the first satellite fix, in a georeferenced map.")
+@options.flag("--gnss", "Search the start about the first satellite fix, in a georeferenced map.")
 @options.method
 @options.preset
 @options.poses
 @options.imu
 @options.truth
-@click.option("--save-map", is_flag=True, help="Write a map of this drive too, in the frame of the old one.")
-@click.option(
-    "--out",
-    type=options.Place(path_type=Path),
-    metavar="DIR|URL",
-    help="Run folder [default: runs/NAME-METHOD-in-map-TIME].",
+@options.flag("--save-map", "Write a map of this drive too, in the frame of the old one.")
+@options.option(
+    "--out", "DIR|URL", "Run folder [default: runs/NAME-METHOD-in-map-TIME].", type=options.Place(path_type=Path)
 )
-@options.resumed
-@options.replaced
-@click.option("--first", type=int, metavar="N", help="First scan used.")
-@click.option("--count", type=int, metavar="N", help="Number of scans used.")
-@click.option("--skip-frames", type=int, metavar="N", help="Use every N-th scan.")
+@options.resume
+@options.overwrite
+@options.integer("--first", "N", "First scan used.")
+@options.integer("--count", "N", "Number of scans used.")
+@options.integer("--skip-frames", "N", "Use every N-th scan.")
 @options.threads
-@click.option("--strict", is_flag=True, help="Exit 4 when anything was degraded: a scan that the map does not hold.")
+@options.flag("--strict", "Exit 4 when anything was degraded: a scan that the map does not hold.")
 @options.dry_run
 @options.reading
 @options.data_root
@@ -65,13 +57,14 @@ def command(sequence: str, map_path: Path, **given: Any) -> None:
     in the map.
     """
     options.require_there(map_path)
-    settings = [f"localize.map={json.dumps(str(map_path.absolute()), ensure_ascii=False)}", "loops.use=false"]
-    if given["start"] is not None:
-        settings.append(f"localize.start={json.dumps(_start_of(given['start']))}")
-    if not given["save_map"]:
-        settings.append("map.write=false")
+    flags = {
+        "localize.map": options.file_setting(map_path),
+        "loops.use": "false",
+        "localize.start": None if given["start"] is None else json.dumps(_start_of(given["start"])),
+        "map.write": None if given["save_map"] else "false",
+    }
     about = {"start": given["first"], "gnss": "fit" if given["gnss"] else None}
-    about["settings"] = (*given["settings"], *settings)
+    about["settings"] = tuple(options.settings_of(flags, given["settings"]))
     click.get_current_context().invoke(main_job.command, sequence=sequence, **{**given, **about})
 
 

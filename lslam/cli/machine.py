@@ -28,16 +28,8 @@ EXTRAS = {
 }
 
 LIBRARIES = (
-    "numpy",
-    "numba",
-    "scipy",
-    "kiss-icp",
-    "gtsam",
-    "open3d-cpu",
-    "open3d",
-    "pyproj",
-    "shapely",
-    "embreex",
+    *("numpy", "numba", "scipy", "kiss-icp", "gtsam", "open3d-cpu", "open3d"),
+    *("pyproj", "shapely", "embreex"),
 )
 
 
@@ -56,14 +48,13 @@ def machine_document() -> dict[str, Any]:
         "libraries": library_versions,
         "extras": _extras,
     }
-    return {name: _told(part) for name, part in parts.items()}
-
-
-def _told(part: Callable[[], Any]) -> Any:
-    try:
-        return part()
-    except Exception as error:  # whatever is broken on this machine is what the command is asked about
-        return {"problem": f"cannot be told ({type(error).__name__}: {error})"}
+    document = {}
+    for name, part in parts.items():
+        try:
+            document[name] = part()
+        except Exception as error:  # whatever is broken on this machine is what the command is asked about
+            document[name] = {"problem": f"cannot be told ({type(error).__name__}: {error})"}
+    return document
 
 
 def _cores() -> dict[str, Any]:
@@ -84,14 +75,14 @@ def _memory() -> dict[str, Any]:
 
 def _container(limit: str) -> float | None:
     """Least limit that the control groups of this process set, in cores or bytes; None without any (version 2, Linux)."""
-    found = []
+    limits = []
     line = CGROUP.read_text().splitlines()[-1] if CGROUP.exists() else ""
     inner = CGROUPS / line.rpartition(":")[2].lstrip("/")
     for folder in (inner, *inner.parents):
         words = (folder / limit).read_text().split() if (folder / limit).is_file() else ["max"]
         if words[0] != "max":
-            found.append(float(words[0]) / float(words[1] if len(words) > 1 else 1))
-    return min(found, default=None)
+            limits.append(float(words[0]) / float(words[1] if len(words) > 1 else 1))
+    return min(limits, default=None)
 
 
 def _kernels() -> dict[str, Any]:
@@ -126,13 +117,13 @@ def library_versions() -> dict[str, str | None]:
     """Versions of libraries; None for one that is not installed."""
     from importlib.metadata import PackageNotFoundError, version
 
-    found: dict[str, str | None] = {}
+    versions: dict[str, str | None] = {}
     for name in LIBRARIES:
         try:
-            found[name] = version(name)
+            versions[name] = version(name)
         except PackageNotFoundError:
-            found[name] = None
-    return found
+            versions[name] = None
+    return versions
 
 
 def _extras() -> dict[str, Any]:
@@ -146,13 +137,13 @@ def _extras() -> dict[str, Any]:
     }
 
 
-def machine_lines(document: dict[str, Any]) -> Iterator[str]:
-    """The document as lines for people."""
+def machine_rows(document: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    """The document for people: names and lines."""
     for name, say in _LINES.items():
         part = document[name]
-        is_broken = isinstance(part, dict) and "problem" in part
-        for k, text in enumerate([part["problem"]] if is_broken else say(part)):
-            yield f"{'' if k else name:<10} {text}".rstrip()
+        has_problem = isinstance(part, dict) and "problem" in part
+        for k, text in enumerate([part["problem"]] if has_problem else say(part)):
+            yield "" if k else name, text
 
 
 def _gb(size: float | None) -> str:

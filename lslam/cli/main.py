@@ -85,8 +85,8 @@ class LazyGroup(click.Group):
             formatter.write_dl(list(COMMANDS.items()))
 
 
-def _print_version(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:
-    if not wanted or ctx.resilient_parsing:
+def _print_version(ctx: click.Context, _: click.Parameter, wants_version: bool) -> None:
+    if not wants_version or ctx.resilient_parsing:
         return
     from lslam.cli.machine import library_versions
 
@@ -121,7 +121,7 @@ def main() -> NoReturn:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # an ASCII terminal shows ? for ±, instead of an error after hours
     if "--progress=json" in sys.argv or ("--progress", "json") in pairwise(sys.argv):
-        from lslam.cli.events import begin_events
+        from lslam.cli.console import begin_events
 
         begin_events()  # before the options are read, of which one may be wrong
     # SIGTERM ends lslam as Ctrl-C does, with exit code 130 and without partly written files.
@@ -153,19 +153,19 @@ def _exit_codes() -> Iterator[None]:
     except Exception as error:
         if is_interrupt(error):
             _fail("interrupted", 130)
-        _fail_unexpected(error)
+        _report_mistake(error)
 
 
-def _fail(said: str, code: int) -> NoReturn:
+def _fail(message: str, code: int) -> NoReturn:
     is_too_late()
-    said = sentence(said)
-    from lslam.cli.events import events
+    message = sentence(message)
+    from lslam.cli.console import events
 
-    told = events()
-    if told is not None:
-        told.tell("error", text=said, exit_code=code)
+    to = events()
+    if to is not None:
+        to.tell("error", text=message, exit_code=code)
     else:
-        click.echo(said if code == 130 else f"error: {said}", err=True)
+        click.echo(message if code == 130 else f"error: {message}", err=True)
     sys.exit(code)
 
 
@@ -179,7 +179,7 @@ def _fail_usage(error: click.ClickException) -> NoReturn:
     _fail(f"{error.format_message().rstrip('.')}; see {command} --help", 2)
 
 
-def _fail_unexpected(error: Exception) -> NoReturn:
+def _report_mistake(error: Exception) -> NoReturn:
     """Report an error of lslam itself in one sentence, with the traceback in the debug log alone."""
     import logging
 

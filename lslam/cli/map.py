@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
@@ -11,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lslam.cli import options
-from lslam.cli.console import progress, setup_logging, show
+from lslam.cli.console import setup_logging, show, show_json, show_rows
+from lslam.cli.one_run import watch_pass
 from lslam.core.errors import UsageError
-from lslam.core.stopping import handle_signals
 
 if TYPE_CHECKING:
     from lslam.core.types.gnss import OutputCrs
@@ -23,23 +22,11 @@ if TYPE_CHECKING:
 
 
 # What a map is made with, and how clouds are scored: no part of a comparison of drives.
-_OTHERS = (
-    "file_format",
-    "attributes",
-    "crop",
-    "clean",
-    "colour",
-    "occupancy",
-    "denoise",
-    "mesh",
-    "crs",
-    "geoid",
-    "out",
-    "is_scored",
-    "threshold",
-    "radius",
+_NOT_OF_CHANGES = (
+    *("file_format", "attributes", "crop", "clean", "colour", "occupancy", "denoise", "mesh", "crs", "geoid", "out"),
+    *("scores", "threshold", "radius"),
 )
-_FLAGS = {"file_format": "format", "is_scored": "score"}
+_FLAGS = {"file_format": "format", "scores": "score"}
 # Rows of the table, at most; the files have all.
 _MOST = 20
 
@@ -49,7 +36,7 @@ def compare_drives(target: Path, given: dict[str, Any]) -> None:
     folder, against = given["changes"], given["against"]
     if against is None:
         raise UsageError("--changes needs the run to compare with: --against RUN")
-    for name in _OTHERS:
+    for name in _NOT_OF_CHANGES:
         if given[name]:
             raise UsageError(f"--{_FLAGS.get(name, name)} has no meaning with --changes: leave one out")
     options.require_there(target, against)
@@ -64,11 +51,10 @@ def compare_drives(target: Path, given: dict[str, Any]) -> None:
     scans = open_scans(new, given["sequence"], **options.reading_of(given))
     earlier = open_scans(old, given["against_sequence"], flag="--against-sequence")
     steps = len(old.trajectory) + len(new.trajectory)
-    with output_folder(folder, given["overwrite"]), handle_signals() as stop, progress("changes", steps) as advance:
-        stop.is_gentle = True
-        found = compare_runs((new, scans), (old, earlier), T, spool=folder, on_step=advance, should_stop=stop)
-        write_changes(folder, found, new, old)
-    _print_changes(folder, found, given["as_json"])
+    with output_folder(folder, given["overwrite"]), watch_pass("changes", steps) as watch:
+        result = compare_runs((new, scans), (old, earlier), T, spool=folder, watch=watch)
+        write_changes(folder, result, new, old)
+    _print_changes(folder, result, given["as_json"])
 
 
 def of_the_map(settings: Iterable[str]) -> list[str]:
@@ -79,49 +65,41 @@ def of_the_map(settings: Iterable[str]) -> list[str]:
     return list(settings)
 
 
-def _print_changes(folder: Path, found: ChangedCells, as_json: bool) -> None:
+def _print_changes(folder: Path, result: ChangedCells, as_json: bool) -> None:
     from lslam.pipeline.change_pass import AREAS, CLOUD, properties
 
-    things = [properties(number, change) for number, change in enumerate(found.changes, 1)]
-    cells = {
-        "same": len(found.same),
-        "occupied_new": found.occupied_new,
-        "occupied_old": found.occupied_old,
-        "unseen_new": found.unseen_new,
-        "unseen_old": found.unseen_old,
-    }
+    things = [properties(number, change) for number, change in enumerate(result.changes, 1)]
+    appeared, vanished, same = len(result.of("appeared")), len(result.of("vanished")), len(result.same)
+    names = ("occupied_new", "occupied_old", "unseen_new", "unseen_old")
     if as_json:
         document = {
             "cloud": str(folder / CLOUD),
             "areas": str(folder / AREAS),
-            "voxel_m": found.voxel,
-            "cells": cells,
-            "appeared": len(found.of("appeared")),
-            "vanished": len(found.of("vanished")),
+            "voxel_m": result.voxel,
+            "cells": {"same": same, **{name: getattr(result, name) for name in names}},
+            "appeared": appeared,
+            "vanished": vanished,
             "things": things,
         }
-        show(json.dumps(document, allow_nan=False) + "\n")
+        show_json(document)
         return
     rows = [
-        ("changes", f"{folder / CLOUD}, {folder / AREAS}: cells of {found.voxel:g} m"),
-        ("appeared", f"{len(found.of('appeared'))} things"),
-        ("vanished", f"{len(found.of('vanished'))} things"),
-        ("same", f"{len(found.same)} of {found.occupied_new} occupied cells"),
-        ("unseen", f"{found.unseen_new} cells now, {found.unseen_old} before, that the other drive never saw"),
+        ("changes", f"{folder / CLOUD}, {folder / AREAS}: cells of {result.voxel:g} m"),
+        ("appeared", f"{appeared} things"),
+        ("vanished", f"{vanished} things"),
+        ("same", f"{same} of {result.occupied_new} occupied cells"),
+        ("unseen", f"{result.unseen_new} cells now, {result.unseen_old} before, that the other drive never saw"),
     ]
-    lines = [f"{name:<10} {value}\n" for name, value in rows]
+    show_rows(rows)
     if things:
-        lines.append(
-            f"\n{'':5} {'kind':<10}{'x':>9} {'y':>9} {'length':>7} {'width':>6} {'height':>6} {'cells':>7}  m\n"
-        )
+        show(f"\n{'':5} {'kind':<10}{'x':>9} {'y':>9} {'length':>7} {'width':>6} {'height':>6} {'cells':>7}  m\n")
     for thing in things[:_MOST]:
-        lines.append(
+        show(
             f"{thing['thing']:>5} {thing['kind']:<10}{thing['x_m']:>9.1f} {thing['y_m']:>9.1f} {thing['length_m']:>7.1f} "
             f"{thing['width_m']:>6.1f} {thing['height_m']:>6.1f} {thing['cells']:>7}\n"
         )
     if len(things) > _MOST:
-        lines.append(f"      and {len(things) - _MOST} more in {folder / AREAS}\n")
-    show("".join(lines))
+        show(f"      and {len(things) - _MOST} more in {folder / AREAS}\n")
 
 
 EPILOG = """\b
@@ -138,50 +116,29 @@ Examples:
 
 @click.command(epilog=EPILOG)
 @click.argument("target", metavar="RUN|FILE", type=click.Path(path_type=Path))
-@click.option("--voxel", type=float, metavar="M", help="Edge of a voxel, 0 for every point  [as the run].")
-@click.option("--format", "file_format", metavar="NAME", help="ply, pcd, las or laz  [--out's suffix, or as the run].")
-@click.option(
-    "--attributes", metavar="NAMES", help="Of each point: time,scan,ring,range,observations,class  [as the run]."
-)
-@click.option("--crop", metavar="BOX", help="Keep x_min,x_max,y_min,y_max[,z_min,z_max] of the world, m.")
-@click.option("--clean", is_flag=True, help="Remove moving objects, such as cars and people.")
-@click.option("--colour", is_flag=True, help="Colour the points by the images of the recording's cameras.")
-@click.option("--occupancy", is_flag=True, help="Write occupied and free cells too, and a floor plan.")
-@click.option("--denoise", is_flag=True, help="Remove points far from their neighbours (Open3D).")
-@click.option("--mesh", is_flag=True, help="Write a surface too, FILE_mesh.ply (Open3D).")
-@click.option("--crs", metavar="EPSG:N[+M]", help="Coordinates of las and laz of a georeferenced run, +M of heights.")
-@click.option("--geoid", metavar="GRID", help="Heights of las and laz above this geoid (.gtx, .tif).")
-@click.option(
-    "--tiles", type=float, metavar="M", help="Square tiles with this edge and an index, for maps of any size."
-)
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    metavar="PATH",
-    help="Map file  [RUN/map.FORMAT], or folder of tiles  [RUN/tiles].",
-)
-@click.option("--overwrite", is_flag=True, help="Replace existing files.")
-@options.moved_sequence
-@click.option("--score", "is_scored", is_flag=True, help="Only compute the crispness of the map of RUN, or of FILE.")
-@click.option(
-    "--against", type=click.Path(path_type=Path), metavar="CLOUD|RUN", help="Only compare with this cloud or run."
-)
-@click.option(
-    "--changes",
-    type=click.Path(path_type=Path),
-    metavar="DIR",
-    help="--against RUN: write there what appeared and vanished.",
-)
-@click.option(
-    "--against-sequence",
-    type=click.Path(path_type=Path),
-    metavar="PATH",
-    help="--changes: sequence of the other run's raw scans, when it has moved.",
-)
-@click.option("--threshold", type=float, metavar="M", help="--against: largest distance of matching points  [0.2].")
-@click.option("--radius", type=float, metavar="M", help="--score: radius of neighbourhoods  [0.5].")
+@options.real("--voxel", "M", "Edge of a voxel, 0 for every point  [as the run].")
+@options.option("--format", "file_format", "NAME", "ply, pcd, las or laz  [--out's suffix, or as the run].")
+@options.option("--attributes", "NAMES", "Of each point: time,scan,ring,range,observations,class  [as the run].")
+@options.option("--crop", "BOX", "Keep x_min,x_max,y_min,y_max[,z_min,z_max] of the world, m.")
+@options.flag("--clean", "Remove moving objects, such as cars and people.")
+@options.flag("--colour", "Colour the points by the images of the recording's cameras.")
+@options.flag("--occupancy", "Write occupied and free cells too, and a floor plan.")
+@options.flag("--denoise", "Remove points far from their neighbours (Open3D).")
+@options.flag("--mesh", "Write a surface too, FILE_mesh.ply (Open3D).")
+@options.option("--crs", "EPSG:N[+M]", "Coordinates of las and laz of a georeferenced run, +M of heights.")
+@options.option("--geoid", "GRID", "Heights of las and laz above this geoid (.gtx, .tif).")
+@options.real("--tiles", "M", "Square tiles with this edge and an index, for maps of any size.")
+@options.path("--out", "PATH", "Map file  [RUN/map.FORMAT], or folder of tiles  [RUN/tiles].")
+@options.flag("--overwrite", "Replace existing files.")
+@options.new_sequence
+@options.flag("--score", "scores", "Only compute the crispness of the map of RUN, or of FILE.")
+@options.path("--against", "CLOUD|RUN", "Only compare with this cloud or run.")
+@options.path("--changes", "DIR", "--against RUN: write there what appeared and vanished.")
+@options.path("--against-sequence", "PATH", "--changes: sequence of the other run's raw scans, when it has moved.")
+@options.real("--threshold", "M", "--against: largest distance of matching points  [0.2].")
+@options.real("--radius", "M", "--score: radius of neighbourhoods  [0.5].")
 @options.reading
-@click.option("--set", "settings", multiple=True, metavar="map.KEY=VALUE", help="Set one key of the map; repeatable.")
+@options.settings("map.KEY=VALUE", "Set one key of the map; repeatable.")
 @options.as_json
 @options.verbosity
 def command(target: Path, **given: Any) -> None:
@@ -196,7 +153,7 @@ def command(target: Path, **given: Any) -> None:
         compare_drives(target, given)
     elif given["against_sequence"] is not None:
         raise click.UsageError("--against-sequence belongs to --changes")
-    elif given["is_scored"] or given["against"] is not None:
+    elif given["scores"] or given["against"] is not None:
         _measure(target, given)
     else:
         _rebuild(target, given)
@@ -213,34 +170,30 @@ def _measure(target: Path, given: dict[str, Any]) -> None:
     cloud = read_cloud(path)
     document: dict[str, Any] = {"file": str(path)}
     rows = [("map", str(path))]
-    if given["is_scored"]:
+    if given["scores"]:
         score = crispness(cloud, given["radius"] or RADIUS)
         document["crispness"] = crispness_document(score)
         rows += crispness_rows(score)
     if given["against"] is not None:
-        found = compare(
-            cloud, read_cloud(given["against"]), THRESHOLD if given["threshold"] is None else given["threshold"]
-        )
-        document["against"] = strict({"file": str(given["against"]), "recipe": found.recipe, **asdict(found)})
+        threshold = THRESHOLD if given["threshold"] is None else given["threshold"]
+        match = compare(cloud, read_cloud(given["against"]), threshold)
+        document["against"] = strict({"file": str(given["against"]), "recipe": match.recipe, **asdict(match)})
+        to, back = match.mean_to_reference, match.mean_from_reference
         rows += [
             ("against", str(given["against"])),
-            ("F1", f"{found.f1:.4f} (precision {found.precision:.4f}, recall {found.recall:.4f})"),
-            (
-                "Chamfer",
-                f"{found.chamfer:.4f} m (to it {found.mean_to_reference:.4f}, from it {found.mean_from_reference:.4f})",
-            ),
-            ("", found.recipe),
+            ("F1", f"{match.f1:.4f} (precision {match.precision:.4f}, recall {match.recall:.4f})"),
+            ("Chamfer", f"{match.chamfer:.4f} m (to it {to:.4f}, from it {back:.4f})"),
+            ("", match.recipe),
         ]
     _print(rows, document, given["as_json"])
 
 
 def _rebuild(target: Path, given: dict[str, Any]) -> None:
-    from lslam.core.errors import UsageError
     from lslam.pipeline.run_folder import require_run
 
-    for flag in ("threshold", "radius"):
+    for flag, other in (("threshold", "--against"), ("radius", "--score")):
         if given[flag] is not None:
-            raise UsageError(f"--{flag} belongs to {'--against' if flag == 'threshold' else '--score'}")
+            raise UsageError(f"--{flag} belongs to {other}")
     settings = _settings(given if given["tiles"] is None else {**given, "out": None})
     require_run(target)
     from lslam.pipeline.rebuild import check_output, open_scans, read_run, rebuild
@@ -254,34 +207,31 @@ def _rebuild(target: Path, given: dict[str, Any]) -> None:
         return
     check_output(out or target / f"map.{run.config.map.format}", given["overwrite"])
     sequence = open_scans(run, given["sequence"], **options.reading_of(given))
-    with handle_signals() as stop, progress("map", len(run.trajectory)) as advance:
-        stop.is_gentle = True
-        built = rebuild(run, sequence, out, overwrite=given["overwrite"], crs=crs, on_step=advance, should_stop=stop)
-    rows = [("map", f"{built.path}: {built.points} points of {built.scans} scans")]
-    document: dict[str, Any] = {"file": str(built.path), "points": built.points, "scans": built.scans}
-    if built.colour is not None:
-        rows.append(("colour", str(built.colour)))
-        document["colour"] = asdict(built.colour)
-    if built.crispness is not None:
-        document["crispness"] = crispness_document(built.crispness)
-    _print([*rows, *crispness_rows(built.crispness)], document, given["as_json"])
+    with watch_pass("map", len(run.trajectory)) as watch:
+        result = rebuild(run, sequence, out, overwrite=given["overwrite"], crs=crs, watch=watch)
+    rows = [("map", f"{result.path}: {result.points} points of {result.scans} scans")]
+    document: dict[str, Any] = {"file": str(result.path), "points": result.points, "scans": result.scans}
+    if result.colour is not None:
+        rows.append(("colour", str(result.colour)))
+        document["colour"] = asdict(result.colour)
+    if result.crispness is not None:
+        document["crispness"] = crispness_document(result.crispness)
+    _print([*rows, *crispness_rows(result.crispness)], document, given["as_json"])
 
 
 def _rebuild_tiles(run: EarlierRun, folder: Path, crs: OutputCrs | None, given: dict[str, Any]) -> None:
-    from lslam.core.errors import UsageError
     from lslam.pipeline.map_tiles import check_tiles, rebuild_in_tiles
     from lslam.pipeline.rebuild import open_scans
 
     if given["mesh"] or given["occupancy"]:
         raise UsageError("--tiles divides the points alone: leave out --mesh and --occupancy")
-    check_tiles(folder, given["tiles"], given["overwrite"])
+    size = given["tiles"]
+    check_tiles(folder, size, given["overwrite"])
     sequence = open_scans(run, given["sequence"], **options.reading_of(given))
-    with handle_signals() as stop, progress("map", len(run.trajectory)) as advance:
-        stop.is_gentle = True
-        index = rebuild_in_tiles(run, sequence, folder, given["tiles"], crs=crs, on_step=advance, should_stop=stop)
-    tiles = len(index["tiles"])
+    with watch_pass("map", len(run.trajectory)) as watch:
+        index = rebuild_in_tiles(run, sequence, folder, size, crs=crs, watch=watch)
     rows = [
-        ("tiles", f"{folder}: {tiles} of {given['tiles']:g} m, {index['points']} points"),
+        ("tiles", f"{folder}: {len(index['tiles'])} of {size:g} m, {index['points']} points"),
         ("index", str(folder / "map.json")),
     ]
     _print(rows, {"folder": str(folder), **index}, given["as_json"])
@@ -289,28 +239,21 @@ def _rebuild_tiles(run: EarlierRun, folder: Path, crs: OutputCrs | None, given: 
 
 def _settings(given: dict[str, Any]) -> list[str]:
     """Flags over --set, as settings of the section `map`."""
-    from lslam.core.errors import UsageError
-
     out: Path | None = given["out"]
     suffix = None if out is None else out.suffix.lower().lstrip(".")
     file_format = given["file_format"]
     if file_format is not None and suffix is not None and file_format != suffix:
         raise UsageError(f"--format {file_format} contradicts --out {out}: leave one out")
+    if file_format is None and suffix in ("ply", "pcd", "las", "laz"):
+        file_format = suffix
     flags = {
-        "voxel": given["voxel"],
-        "attributes": given["attributes"],
-        "format": file_format
-        if file_format is not None
-        else suffix
-        if suffix in ("ply", "pcd", "las", "laz")
-        else None,
-        "crop": None if given["crop"] is None else f"[{given['crop']}]",
-        **{name: "true" if given[name] else None for name in ("clean", "colour", "occupancy", "denoise", "mesh")},
+        "map.voxel": given["voxel"],
+        "map.attributes": given["attributes"],
+        "map.format": file_format,
+        "map.crop": None if given["crop"] is None else f"[{given['crop']}]",
+        **{f"map.{key}": options.true_if(given[key]) for key in ("clean", "colour", "occupancy", "denoise", "mesh")},
     }
-    return [
-        *of_the_map(given["settings"]),
-        *(f"map.{key}={value}" for key, value in flags.items() if value is not None),
-    ]
+    return options.settings_of(flags, of_the_map(given["settings"]))
 
 
 def crispness_rows(score: Crispness | None) -> list[tuple[str, str]]:
@@ -327,4 +270,7 @@ def crispness_rows(score: Crispness | None) -> list[tuple[str, str]]:
 
 
 def _print(rows: list[tuple[str, str]], document: dict[str, Any], as_json: bool) -> None:
-    show(json.dumps(document, allow_nan=False) + "\n" if as_json else "".join(f"{n:<10} {v}\n" for n, v in rows))
+    if as_json:
+        show_json(document)
+    else:
+        show_rows(rows)

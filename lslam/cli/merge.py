@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import shlex
-import sys
 import time
 from contextlib import ExitStack
 from pathlib import Path
@@ -13,7 +10,7 @@ from typing import Any
 import click
 
 from lslam.cli import options
-from lslam.cli.console import setup_logging, show
+from lslam.cli.console import setup_logging, show, show_json
 from lslam.core.stopping import handle_signals
 
 
@@ -22,15 +19,13 @@ from lslam.core.stopping import handle_signals
     "          lslam merge runs/town runs/friday --out runs/town2 --format laz"
 )
 @click.argument("runs", nargs=-1, required=True, metavar="RUN RUN...", type=click.Path(path_type=Path))
-@click.option(
-    "--out", type=click.Path(path_type=Path), metavar="DIR", help="Folder to write [default: runs/merged-TIME]."
-)
-@click.option("--voxel", type=float, metavar="M", help="Edge of a voxel of the map.")
-@click.option("--format", "file_format", metavar="NAME", help="Of the map: ply, pcd, las or laz [default: ply].")
-@click.option("--no-map", is_flag=True, help="Poses only.")
+@options.path("--out", "DIR", "Folder to write [default: runs/merged-TIME].")
+@options.real("--voxel", "M", "Edge of a voxel of the map.")
+@options.option("--format", "file_format", "NAME", "Of the map: ply, pcd, las or laz [default: ply].")
+@options.flag("--no-map", "Poses only.")
 @options.threads
-@click.option("--resume", is_flag=True, help="Go on with an interrupted merge; needs its --out.")
-@click.option("--overwrite", is_flag=True, help="Replace an earlier result in the folder.")
+@options.flag("--resume", "Go on with an interrupted merge; needs its --out.")
+@options.flag("--overwrite", "Replace an earlier result in the folder.")
 @options.configuration
 @options.as_json
 @options.verbosity
@@ -40,13 +35,8 @@ def command(runs: tuple[Path, ...], **given: Any) -> None:
     The first run gives the frame. RUN may be the folder of an earlier merge, whose runs then stand in its place. A run that
     cannot be tied to the others is left out and named; exit 1 when none can.
     """
-    from lslam.core.errors import UsageError
-
     setup_logging(given["verbose"], given["quiet"])
-    if given["overwrite"] and given["resume"]:
-        raise UsageError("--overwrite merges anew and --resume keeps finished parts: give one of them")
-    if given["resume"] and given["out"] is None:
-        raise UsageError("--resume needs --out: the folder of the interrupted merge")
+    options.check_resume(given, "merge")
     options.require_there(*runs)
     from lslam.core.config import load_config
     from lslam.pipeline.merged_folder import merge_into
@@ -61,23 +51,18 @@ def command(runs: tuple[Path, ...], **given: Any) -> None:
         "input.threads": given["threads"],
         "map.write": "false" if given["no_map"] else None,
     }
-    settings = [*given["settings"], *(f"{key}={value}" for key, value in flags.items() if value is not None)]
-    config = load_config(given["config_file"], settings)
+    config = load_config(given["config_file"], options.settings_of(flags, given["settings"]))
     from lslam.cli.one_run import watch_of
 
     with handle_signals() as stop, ExitStack() as stack:
         watch = watch_of(stack, stop, lambda outcome: None)
         stop.is_gentle = True
-        manifest = merge_into(
-            runs,
-            out,
-            config,
-            watch,
-            overwrite=given["overwrite"],
-            resume=given["resume"],
-            command=shlex.join(["lslam", *sys.argv[1:]]),
-        )
-    show(json.dumps({"folder": str(out), "manifest": manifest}) + "\n" if given["as_json"] else _summary(out, manifest))
+        folders = {name: given[name] for name in ("overwrite", "resume")}
+        manifest = merge_into(runs, out, config, watch, command=options.command_line(), **folders)
+    if given["as_json"]:
+        show_json({"folder": str(out), "manifest": manifest})
+    else:
+        show(_summary(out, manifest))
 
 
 def _summary(out: Path, manifest: dict[str, Any]) -> str:
@@ -86,15 +71,15 @@ def _summary(out: Path, manifest: dict[str, Any]) -> str:
     lines = [f"merged, {count_of(len(manifest['sessions']), 'session')}", f"  {'status':<12} {manifest['status']}"]
     lines += [f"  {'':<12} {problem}" for problem in manifest["problems"]]
     for one in manifest["sessions"]:
-        found = (
+        place = (
             f"found by {one['votes']} of {count_of(one['tried'], 'keyframe')} tried"
             if one["tried"]
             else "gives the world"
         )
-        said = f"{count_of(one['scans'], 'scan')}, {found}, {count_of(one['loops_between'], 'loop')} with others"
+        text = f"{count_of(one['scans'], 'scan')}, {place}, {count_of(one['loops_between'], 'loop')} with others"
         if one["ate"] is not None:
-            said += f"; ATE se3 {metres(one['ate'][0])} m alone, {metres(one['ate'][1])} m merged"
-        lines.append(f"  {one['name']:<12} {said}")
+            text += f"; ATE se3 {metres(one['ate'][0])} m alone, {metres(one['ate'][1])} m merged"
+        lines.append(f"  {one['name']:<12} {text}")
     graph = manifest["graph"]
     lines.append(f"  {'graph':<12} {graph['keyframes']} keyframes, {count_of(graph['loops'], 'loop')} in all")
     lines += [f"  {name:<12} {out / name}" for name in ("sessions", "report.html") if (out / name).exists()]

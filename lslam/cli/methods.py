@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 import click
 
 from lslam.cli import options
+from lslam.cli.console import show_json
 
 if TYPE_CHECKING:
     from lslam.odometry import ListedMethod
@@ -24,7 +24,7 @@ def command(as_json: bool) -> None:
 
     methods = listed_methods()
     if as_json:
-        click.echo(json.dumps({"methods": [asdict(method) for method in methods]}, indent=1))
+        show_json({"methods": [asdict(method) for method in methods]}, indent=1)
         return
     width = max(len(method.name) for method in methods)
     groups: dict[str, list[ListedMethod]] = {}

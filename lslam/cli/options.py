@@ -6,13 +6,14 @@ import json
 import os
 import shlex
 import sys
-import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
+from click.core import ParameterSource
 
 from lslam.core.errors import ConfigError, InputError, UsageError, nearest
 from lslam.io.remote import RemotePath, as_path
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from lslam.core.config.input import ScanRange
     from lslam.core.types.gnss import OutputCrs
     from lslam.studies.jobs import Engine
-    from lslam.studies.output import OutputOptions
+    from lslam.studies.options import OutputOptions
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -36,95 +37,139 @@ class Place(click.Path):
         return super().convert(value, param, ctx)
 
 
+def option(*words: str, **more: Any) -> Callable[[F], F]:
+    """Option by its names, the placeholder of its value, and its text; more : as of `click.option`."""
+    *names, metavar, text = words
+    return click.option(*names, metavar=metavar, help=text, **more)
+
+
+path = partial(option, type=click.Path(path_type=Path))
+integer = partial(option, type=int)
+real = partial(option, type=float)
+
+
+def flag(*words: str, **more: Any) -> Callable[[F], F]:
+    """Option without a value by its names and its text."""
+    *names, text = words
+    return click.option(*names, is_flag=True, help=text, **more)
+
+
+def group(*options: Callable[[F], F]) -> Callable[[F], F]:
+    """Options in the order in which `--help` lists them."""
+
+    def add(function: F) -> F:
+        for one in reversed(options):
+            function = one(function)
+        return function
+
+    return add
+
+
 # Of several commands.
-data_root = click.option(
-    "--data-root",
-    type=click.Path(path_type=Path),
-    envvar="LSLAM_DATA",
-    metavar="DIR",
-    help="Where names like seq07 are looked up [env: LSLAM_DATA].",
-)
-preset = click.option("--preset", metavar="NAME|FILE", help="Configuration to start from, see `lslam config presets`.")
-as_json = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout.")
-metrics = click.option(
-    "--metrics", multiple=True, metavar="WORD", help="Show more metrics: thesis for those of the theses."
-)
-set_in_all_runs = click.option(
-    "--set", "settings", multiple=True, metavar="SECTION.KEY=VALUE", help="Set one key in all runs; repeatable."
-)
-refine = click.option(
-    "--refine", is_flag=True, help="Correct all scans at once for the planes they saw, where that makes them thinner."
-)
+data_root = path("--data-root", "DIR", "Where names like seq07 are looked up [env: LSLAM_DATA].", envvar="LSLAM_DATA")
+preset = option("--preset", "NAME|FILE", "Configuration to start from, see `lslam config presets`.")
+as_json = flag("--json", "as_json", "Print one JSON object on stdout.")
+metrics = option("--metrics", "WORD", "Show more metrics: thesis for those of the theses.", multiple=True)
+settings = partial(option, "--set", "settings", multiple=True)
+set_in_all_runs = settings("SECTION.KEY=VALUE", "Set one key in all runs; repeatable.")
+refine = flag("--refine", "Correct all scans at once for the planes they saw, where that makes them thinner.")
 fixes_as_factors = click.option(
     "--gnss", "gnss", flag_value="graph", default=None, help="Satellite fixes are factors of the pose graph."
 )
 fixes_at_the_end = click.option(
     "--georeference", "gnss", flag_value="fit", help="Satellite fixes only georeference the result."
 )
-truth = click.option(
-    "--gt", type=click.Path(path_type=Path), metavar="FILE", help="Ground truth instead of the sequence's own."
-)
-moved_sequence = click.option(
-    "--sequence", type=click.Path(path_type=Path), metavar="PATH", help="Sequence of the raw scans, when it has moved."
-)
-replaced = click.option("--overwrite", is_flag=True, help="Replace an earlier run in the folder.")
-method = click.option("--method", metavar="NAME", help="Odometry method, see `lslam methods` [default: icp].")
-poses = click.option(
-    "--poses",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="Trajectory of another program instead of odometry.",
-)
+truth = path("--gt", "FILE", "Ground truth instead of the sequence's own.")
+new_sequence = path("--sequence", "PATH", "Sequence of the raw scans, when it has moved.")
+overwrite = flag("--overwrite", "Replace an earlier run in the folder.")
+method = option("--method", "NAME", "Odometry method, see `lslam methods` [default: icp].")
+poses = path("--poses", "FILE", "Trajectory of another program instead of odometry.")
 imu = click.option("--imu/--no-imu", default=None, help="Predict and deskew with the IMU [default: no].")
-wheels = click.option(
+wheels = option(
     "--wheels",
-    metavar="TOPIC|FILE",
-    help="Predict with speeds of wheels: a topic of the bag (Odometry, TwistStamped), or a CSV file beside the scans.",
+    "TOPIC|FILE",
+    "Predict with speeds of wheels: a topic of the bag (Odometry, TwistStamped), or a CSV file beside the scans.",
 )
-resumed = click.option(
-    "--resume", is_flag=True, help="Go on with a run that was killed or interrupted; needs its --out."
-)
-threads = click.option(
-    "--threads", type=int, metavar="N", help="0: as many as there are cores; 1: one. Results stay the same."
-)
-dry_run = click.option("--dry-run", is_flag=True, help="Resolve everything, write nothing.")
+resume = flag("--resume", "Go on with a run that was killed or interrupted; needs its --out.")
+threads = integer("--threads", "N", "0: as many as there are cores; 1: one. Results stay the same.")
+dry_run = flag("--dry-run", "Resolve everything, write nothing.")
 
-
-def verbosity(function: F) -> F:
-    """Decorator that adds --verbose, --quiet and --progress."""
-    function = click.option(
+verbosity = group(
+    flag("-q", "--quiet", "Only warnings and errors on stderr."),
+    flag("-v", "--verbose", "Log debugging messages on stderr."),
+    click.option(
         "--progress",
         type=click.Choice(("text", "json")),
         default="text",
         expose_value=False,  # `main` has seen it
         help="json: each event a JSON object on a line of stderr, for scripts.",
-    )(function)
-    function = click.option("-v", "--verbose", is_flag=True, help="Log debugging messages on stderr.")(function)
-    return click.option("-q", "--quiet", is_flag=True, help="Only warnings and errors on stderr.")(function)
-
-
-def scan_range(function: F) -> F:
-    """Decorator that adds --start, --count and --skip-frames."""
-    for name, text in (
-        ("--skip-frames", "Use every N-th scan."),
-        ("--count", "Number of scans used."),
-        ("--start", "First scan used."),
-    ):
-        function = click.option(name, type=int, metavar="N", help=text)(function)
-    return function
-
-
-def scan_ranges(function: F) -> F:
-    """Decorator that adds --start, --count and --skip-frames, of all sequences or of one."""
-    for name, text in (
-        ("--skip-frames", "Use every N-th scan"),
-        ("--count", "Number of scans used"),
-        ("--start", "First scan used"),
-    ):
-        function = click.option(
-            name, multiple=True, metavar="[SEQUENCE=]N", help=f"{text}, of one SEQUENCE or of all; repeatable."
-        )(function)
-    return function
+    ),
+)
+_RANGE = {"--start": "First scan used", "--count": "Number of scans used", "--skip-frames": "Use every N-th scan"}
+scan_range = group(*(integer(name, "N", f"{text}.") for name, text in _RANGE.items()))
+scan_ranges = group(
+    *(
+        option(name, "[SEQUENCE=]N", f"{text}, of one SEQUENCE or of all; repeatable.", multiple=True)
+        for name, text in _RANGE.items()
+    )
+)
+reading = group(
+    option(
+        "--lidar-topic",
+        "TOPIC",
+        "Of a bag: the topic of the scans; several LiDARs are merged into the sweeps of the first.",
+        multiple=True,
+        callback=lambda context, option, topics: ",".join(topics) or None,
+    ),
+    option("--imu-topic", "TOPIC", "Of a bag: the topic of the IMU."),
+    option("--gnss-topic", "TOPIC", "Of a bag: the topic of satellite fixes."),
+    option("--lidar-frame", "NAME|all", "Of a bag: which LiDAR of a topic that several share; all merges them."),
+    click.option(
+        "--point-times",
+        type=click.Choice(("auto", "field", "columns", "order", "azimuth", "none")),
+        help="What tells when each point was measured.  [default: auto]",
+    ),
+    option("--extrinsics", "T|FILE", "The IMU in the LiDAR's frame: 12, 16 or 7 numbers, or a file with them."),
+)
+manual = group(
+    path(
+        "--loops-file",
+        "FILE",
+        "CSV of pairs of scans that are loops, or must not be: scan_a,scan_b,verdict (known, forbidden).",
+    ),
+    path("--control", "FILE", "CSV of control points, surveyed positions that hold the poses: scan,x,y,z,sigma,crs."),
+)
+configuration = group(
+    path("--config", "config_file", "FILE", "Configuration, TOML."),
+    settings("SECTION.KEY=VALUE", "Set one configuration key; repeatable."),
+)
+coordinates = group(
+    option("--crs", "EPSG:N[+M]", "Coordinates of georeferenced maps, +M of heights [default: control points', UTM]."),
+    option("--geoid", "GRID", "Heights above this geoid (.gtx, .tif) in place of the ellipsoid."),
+)
+resume_or_overwrite = group(
+    flag("--resume", "Keep finished runs of the same input and configuration, go on with the others."),
+    flag("--overwrite", "Run everything anew in an existing folder."),
+)
+study_output = group(
+    resume_or_overwrite,
+    option("--out", "DIR", "Folder of all runs and results [default: runs/NAME-TIME].", type=Place(path_type=Path)),
+    option(
+        "--scenes",
+        "DIR",
+        "Keep simulations here, for others of the same scenarios [default: simulated/ in --out].",
+        type=Place(path_type=Path),
+    ),
+)
+engine = group(
+    integer("--jobs", "N", "Runs at once on this machine [default: one per core]."),
+    option(
+        "--scheduler",
+        "tcp://HOST:PORT",
+        "Make the runs on the Dask cluster of this scheduler; needs the extra `cluster`.",
+    ),
+    option("--cluster", "local:N", "Make the runs with N workers of Dask on this machine."),
+)
 
 
 def ranges_of(given: dict[str, Any], words: Iterable[str]) -> tuple[list[str], dict[str, ScanRange]]:
@@ -158,163 +203,93 @@ def ranges_of(given: dict[str, Any], words: Iterable[str]) -> tuple[list[str], d
     return [f"input.{key}={number}" for key, number in common.items()], own
 
 
-def reading(function: F) -> F:
-    """Decorator that adds --lidar-topic, --lidar-frame, --imu-topic, --gnss-topic, --point-times and --extrinsics."""
-    function = click.option(
-        "--extrinsics", metavar="T|FILE", help="The IMU in the LiDAR's frame: 12, 16 or 7 numbers, or a file with them."
-    )(function)
-    function = click.option(
-        "--point-times",
-        type=click.Choice(("auto", "field", "columns", "order", "azimuth", "none")),
-        help="What tells when each point was measured.  [default: auto]",
-    )(function)
-    function = click.option(
-        "--lidar-frame",
-        metavar="NAME|all",
-        help="Of a bag: which LiDAR of a topic that several share; all merges them.",
-    )(function)
-    for name, text in (("gnss", "satellite fixes"), ("imu", "the IMU")):
-        function = click.option(f"--{name}-topic", metavar="TOPIC", help=f"Of a bag: the topic of {text}.")(function)
-    return click.option(
-        "--lidar-topic",
-        multiple=True,
-        metavar="TOPIC",
-        callback=lambda context, option, topics: ",".join(topics) or None,
-        help="Of a bag: the topic of the scans; several LiDARs are merged into the sweeps of the first.",
-    )(function)
-
-
 def reading_of(given: dict[str, Any]) -> dict[str, Any]:
     """Arguments of `open_sequence` from the options of `reading`."""
     names = ("lidar_topic", "lidar_frame", "imu_topic", "gnss_topic", "point_times", "extrinsics")
     return {name: given[name] for name in names}
 
 
-def manual(function: F) -> F:
-    """Decorator that adds --loops-file and --control."""
-    for name, text in (
-        ("--control", "CSV of control points, surveyed positions that hold the poses: scan,x,y,z,sigma,crs."),
-        (
-            "--loops-file",
-            "CSV of pairs of scans that are loops, or must not be: scan_a,scan_b,verdict (known, forbidden).",
-        ),
-    ):
-        function = click.option(name, type=click.Path(path_type=Path), metavar="FILE", help=text)(function)
-    return function
+def settings_of(flags: dict[str, Any], given: Iterable[str] = ()) -> list[str]:
+    """Settings of --set, overridden by values of flags by configuration key; None is a flag that was not given."""
+    return [*given, *(f"{key}={value}" for key, value in flags.items() if value is not None)]
 
 
-def manual_settings(loops: Path | None, control: Path | None) -> dict[str, str | None]:
-    """Configuration keys of these files, as absolute paths, so that the run's copy of the configuration is valid anywhere."""
-    return {
-        key: None if path is None else json.dumps(str(path.absolute()), ensure_ascii=False)
-        for key, path in (("loops.file", loops), ("graph.control", control))
-    }
+def true_if(flag: bool) -> str | None:
+    """Setting of a flag without a value; None where it was not given."""
+    return "true" if flag else None
 
 
-def configuration(function: F) -> F:
-    """Decorator that adds --config and --set."""
-    function = click.option(
-        "--set",
-        "settings",
-        multiple=True,
-        metavar="SECTION.KEY=VALUE",
-        help="Set one configuration key; repeatable.",
-    )(function)
-    return click.option(
-        "--config",
-        "config_file",
-        type=click.Path(path_type=Path),
-        metavar="FILE",
-        help="Configuration, TOML.",
-    )(function)
+def quote(text: object) -> str | None:
+    """Text as a setting; None stays."""
+    return None if text is None else json.dumps(str(text), ensure_ascii=False)
 
 
-def with_preset(settings: Iterable[str], preset: str | None) -> list[str]:
-    """Settings of --set, overridden by the flag --preset."""
-    return [*settings, *([] if preset is None else [f"odometry.preset={json.dumps(preset)}"])]
+def file_setting(path: str | Path | None) -> str | None:
+    """Absolute path as a setting, so that the run's copy of the configuration is valid anywhere."""
+    return None if path is None else quote(Path(path).expanduser().absolute())
 
 
-def coordinates(function: F) -> F:
-    """Decorator that adds --crs and --geoid."""
-    for name, metavar, text in (
-        ("--geoid", "GRID", "Heights above this geoid (.gtx, .tif) in place of the ellipsoid."),
-        ("--crs", "EPSG:N[+M]", "Coordinates of georeferenced maps, +M of heights [default: control points', UTM]."),
-    ):
-        function = click.option(name, metavar=metavar, help=text)(function)
-    return function
-
-
-def crs_settings(crs: str | None, geoid: str | None) -> dict[str, str | None]:
-    """Configuration keys of these flags. Raises UsageError for an invalid code."""
-    from lslam.core.geometry.geodesy import parse_crs
-
-    epsg, height_epsg = (None, None) if crs is None else parse_crs(f"EPSG:{crs}" if crs[:1].isdecimal() else crs)
-    path = None if geoid is None else grid_file(geoid)
-    return {
-        "gnss.crs": None if epsg is None else str(epsg),
-        "gnss.height_crs": None if height_epsg is None else str(height_epsg),
-        "gnss.geoid": None if path is None else json.dumps(path, ensure_ascii=False),
-    }
-
-
-def grid_file(geoid: str) -> str:
-    """Absolute path of an existing grid file; other names are those of PROJ's own grids."""
-    path = Path(geoid).expanduser()
-    return str(path.absolute()) if path.exists() else geoid
+def crs_settings(given: dict[str, Any]) -> dict[str, Any]:
+    """Values of the options of `coordinates` by configuration key. Raises UsageError for an invalid code."""
+    crs = output_crs(given)
+    if crs is None:
+        return {}
+    return {"gnss.crs": crs.epsg, "gnss.height_crs": crs.height_epsg, "gnss.geoid": quote(crs.geoid or None)}
 
 
 def output_crs(given: dict[str, Any]) -> OutputCrs | None:
     """Coordinates that --crs and --geoid ask for; None without them. Raises UsageError for what is no code."""
+    crs, geoid = given["crs"], given["geoid"] or ""
+    if crs is None and not geoid:
+        return None
     from lslam.core.geometry.geodesy import parse_crs
+
+    epsg, height_epsg = (None, None) if crs is None else parse_crs(f"EPSG:{crs}" if crs[:1].isdecimal() else crs)
+    grid = Path(geoid).expanduser()
+    if geoid and grid.exists():  # other names are those of PROJ's own grids
+        geoid = str(grid.absolute())
     from lslam.core.types.gnss import OutputCrs
 
-    epsg, height_epsg = (None, None) if given["crs"] is None else parse_crs(given["crs"])
-    geoid = "" if given["geoid"] is None else grid_file(given["geoid"])
     return OutputCrs(epsg, height_epsg, geoid) if epsg or geoid else None
 
 
-def studied(function: F) -> F:
-    """Decorator that adds --out, --resume, --overwrite and --scenes."""
-    for name, metavar, text in (
-        ("--scenes", "DIR", "Keep simulations here, for others of the same scenarios [default: simulated/ in --out]."),
-        ("--out", "DIR", "Folder of all runs and results [default: runs/NAME-TIME]."),
-    ):
-        function = click.option(name, type=Place(path_type=Path), metavar=metavar, help=text)(function)
-    for name, text in (
-        ("--overwrite", "Run everything anew in an existing folder."),
-        ("--resume", "Keep finished runs of the same input and configuration, go on with the others."),
-    ):
-        function = click.option(name, is_flag=True, help=text)(function)
-    return function
+def command_line() -> str:
+    """Command as it was typed."""
+    return shlex.join(["lslam", *sys.argv[1:]])
+
+
+def check_resume(given: dict[str, Any], needs_out: str = "") -> None:
+    """Raise UsageError when --overwrite and --resume contradict each other.
+
+    needs_out : what was interrupted, where --resume cannot find it without --out; empty where it can
+    """
+    if given["overwrite"] and given["resume"]:
+        raise UsageError("--overwrite runs everything anew and --resume keeps finished parts: give one of them")
+    if needs_out and given["resume"] and given["out"] is None:
+        raise UsageError(f"--resume needs --out: the folder of the interrupted {needs_out}")
+
+
+def typed_options() -> dict[str, str]:
+    """Flags of the options that were given on the command line, by their names."""
+    context = click.get_current_context()
+    return {
+        option.name: option.opts[0]
+        for option in context.command.params
+        if option.name is not None and context.get_parameter_source(option.name) is ParameterSource.COMMANDLINE
+    }
 
 
 def output_of(given: dict[str, Any], name: str) -> OutputOptions:
-    """Output options of a study, from the options of `studied`."""
-    from lslam.studies.output import OutputOptions
+    """Output options of a study, from the options of `study_output`."""
+    from lslam.studies.options import OutputOptions, folder_by_time
 
-    out = given["out"] or Path("runs") / time.strftime(f"{name}-%Y%m%d-%H%M%S")
+    out = given["out"] or folder_by_time(name)
     if name != "batch" and isinstance(out, RemotePath):
         raise UsageError(
             f"--out {out}: the results of this command are files of this machine; run and batch write to storage"
         )
-    command = shlex.join(["lslam", *sys.argv[1:]])
-    return OutputOptions(out, given["overwrite"], given["resume"], given["scenes"], given["data_root"], command)
-
-
-def engine(function: F) -> F:
-    """Decorator that adds --jobs, --scheduler and --cluster."""
-    for name, kind, metavar, text in (
-        ("--cluster", str, "local:N", "Make the runs with N workers of Dask on this machine."),
-        (
-            "--scheduler",
-            str,
-            "tcp://HOST:PORT",
-            "Make the runs on the Dask cluster of this scheduler; needs the extra `cluster`.",
-        ),
-        ("--jobs", int, "N", "Runs at once on this machine [default: one per core]."),
-    ):
-        function = click.option(name, type=kind, metavar=metavar, help=text)(function)
-    return function
+    scenes = given.get("scenes")
+    return OutputOptions(out, given["overwrite"], given["resume"], scenes, given["data_root"], command_line())
 
 
 def check_engine(given: dict[str, Any]) -> None:
@@ -337,9 +312,9 @@ def engine_of(given: dict[str, Any], title: str, is_persistent: bool = True) -> 
     if scheduler is None and cluster is None:
         yield Local(jobs or os.cpu_count() or 1, is_persistent, title)
         return
-    from lslam.studies.cluster import connected
+    from lslam.studies.cluster import connect
 
-    with connected(scheduler, cluster, title, is_persistent=is_persistent) as engine:
+    with connect(scheduler, cluster, title, is_persistent=is_persistent) as engine:
         yield engine
 
 

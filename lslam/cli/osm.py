@@ -34,109 +34,77 @@ Examples:
 
 
 @command.command(epilog=FETCH_EPILOG)
-@click.option("--bbox", metavar="S,W,N,E", help="A box: south, west, north, east in degrees.")
-@click.option("--around", metavar="LAT,LON", help="The surroundings of a place.")
-@click.option(
-    "--along", metavar="PATH", help="The surroundings of a sequence's satellite fixes, a run folder, or a trajectory."
+@options.option("--bbox", "S,W,N,E", "A box: south, west, north, east in degrees.")
+@options.option("--around", "LAT,LON", "The surroundings of a place.")
+@options.option("--along", "PATH", "The surroundings of a sequence's satellite fixes, a run folder, or a trajectory.")
+@options.real("--radius", "M", "Radius about the place or path  [osm.fetch_radius, 120].")
+@options.option("--origin", "LAT,LON[,H]", "With --along TRAJECTORY in metres: where x = y = 0 is, x east, y north.")
+@options.path(
+    "--out", "FILE", "OSM XML (.osm), or the server's own reply (.json).", default=Path("map.osm"), show_default=True
 )
-@click.option("--radius", type=float, metavar="M", help="Radius about the place or path  [osm.fetch_radius, 120].")
-@click.option(
-    "--origin", metavar="LAT,LON[,H]", help="With --along TRAJECTORY in metres: where x = y = 0 is, x east, y north."
-)
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    default=Path("map.osm"),
-    show_default=True,
-    metavar="FILE",
-    help="OSM XML (.osm), or the server's own reply (.json).",
-)
-@click.option("--overwrite", is_flag=True, help="Replace FILE.")
-@click.option("--server", metavar="URL", help="Another Overpass server  [osm.server].")
-@click.option("--refresh", is_flag=True, help="Ask the server also for areas that are in the cache.")
-@click.option("--offline", is_flag=True, help="Use the cache alone.")
+@options.flag("--overwrite", "Replace FILE.")
+@options.option("--server", "URL", "Another Overpass server  [osm.server].")
+@options.flag("--refresh", "Ask the server also for areas that are in the cache.")
+@options.flag("--offline", "Use the cache alone.")
 @options.data_root
 @options.configuration
 @options.as_json
 @options.verbosity
-def fetch(
-    bbox: str | None,
-    around: str | None,
-    along: str | None,
-    radius: float | None,
-    origin: str | None,
-    out: Path,
-    overwrite: bool,
-    server: str | None,
-    refresh: bool,
-    offline: bool,
-    data_root: Path | None,
-    config_file: Path | None,
-    settings: tuple[str, ...],
-    as_json: bool,
-    verbose: bool,
-    quiet: bool,
-) -> None:
+def fetch(out: Path, **given: Any) -> None:
     """Fetch the buildings of a place from an Overpass server, or from the cache of earlier replies."""
-    if sum(given is not None for given in (bbox, around, along)) != 1:
+    if sum(given[name] is not None for name in ("bbox", "around", "along")) != 1:
         raise click.UsageError("no place is given: give one of --bbox, --around and --along")
-    if refresh and offline:
+    if given["refresh"] and given["offline"]:
         raise click.UsageError("--refresh asks the server and --offline never does: give one of them")
-    if bbox is not None and radius is not None:
+    if given["bbox"] is not None and given["radius"] is not None:
         raise click.UsageError("--radius goes with --around or --along; a --bbox has its size")
-    if origin is not None and along is None:
+    if given["origin"] is not None and given["along"] is None:
         raise click.UsageError("--origin goes with --along, and says where a trajectory in metres lies")
     if out.suffix.lower() not in (".osm", ".xml", ".json"):
         raise click.UsageError(f"--out {out}: end the name with .osm or .json")
-    if bbox is not None:
-        _box(bbox)
-    if around is not None:
-        options.place("--around", around)
-    console.setup_logging(verbose, quiet)
-    import json
-
+    if given["bbox"] is not None:
+        _box(given["bbox"])
+    if given["around"] is not None:
+        options.place("--around", given["around"])
+    console.setup_logging(given["verbose"], given["quiet"])
     from lslam.core.config import load_config
-    from lslam.core.errors import OutputError, OutputExistsError
+    from lslam.core.errors import OutputError
+    from lslam.pipeline.run_folder import require_new
 
-    if out.exists() and not overwrite:
-        raise OutputExistsError(f"{out} exists: give --overwrite to replace it, or another --out")
+    require_new(out, given["overwrite"])
     if not out.absolute().parent.is_dir():
         raise OutputError(f"{out} cannot be written: there is no folder {out.absolute().parent}")
-    more = [f"osm.server={json.dumps(server)}"] if server is not None else []
-    more += ['osm.cache="refresh"'] if refresh else ['osm.cache="only"'] if offline else []
-    config = load_config(config_file, [*settings, *more]).osm
-    bounds = _bounds(bbox, around, along, config.fetch_radius if radius is None else radius, data_root, origin)
+    flags = {
+        "osm.server": options.quote(given["server"]),
+        "osm.cache": '"refresh"' if given["refresh"] else '"only"' if given["offline"] else None,
+    }
+    config = load_config(given["config_file"], options.settings_of(flags, given["settings"])).osm
+    bounds = _bounds(given, config.fetch_radius if given["radius"] is None else given["radius"])
     from lslam.osm.overpass import fetch_buildings, reply_folder
 
     with console.progress("fetching"):
         reply = fetch_buildings(bounds, config, reply_folder())
-    _write(out, reply, as_json)
+    _write(out, reply, given["as_json"])
 
 
 def _box(text: str) -> list[float]:
     return options.numbers("--bbox", text, (4,), "S,W,N,E, for example 49.00,8.40,49.01,8.42")
 
 
-def _bounds(
-    bbox: str | None, around: str | None, along: str | None, radius: float, data_root: Path | None, origin: str | None
-) -> Bounds:
+def _bounds(given: dict[str, Any], radius: float) -> Bounds:
     import numpy as np
 
     from lslam.osm import bounds
-    from lslam.osm.bounds import positions_along
 
-    if bbox is not None:
-        return bounds.Bounds(*_box(bbox))
-    if around is not None:
-        return bounds.around(np.array(options.place("--around", around)[:2]), radius)
-    assert along is not None
-    at = None if origin is None else np.array([*options.place("--origin", origin), 0.0][:3])
-    return bounds.around(positions_along(along, data_root, at), radius)
+    if given["bbox"] is not None:
+        return bounds.Bounds(*_box(given["bbox"]))
+    if given["around"] is not None:
+        return bounds.around(np.array(options.place("--around", given["around"])[:2]), radius)
+    origin = None if given["origin"] is None else np.array([*options.place("--origin", given["origin"]), 0.0][:3])
+    return bounds.around(bounds.positions_along(given["along"], given["data_root"], origin), radius)
 
 
 def _write(out: Path, reply: OverpassReply, as_json: bool) -> None:
-    import json
-
     from lslam.io.formats.atomic import atomic_write
     from lslam.io.formats.osm_buildings import buildings_of, middle_of
     from lslam.io.formats.osm_files import write_osm
@@ -148,20 +116,20 @@ def _write(out: Path, reply: OverpassReply, as_json: bool) -> None:
             stream.write(reply.text)
     else:
         write_osm(out, data)
-    found = len(buildings_of(data, middle_of(data), str(out)).buildings)
-    if not found:
+    count = len(buildings_of(data, middle_of(data), str(out)).buildings)
+    if not count:
         console.log.warning("there is no building in that place")
     if as_json:
-        click.echo(json.dumps({"file": str(out), "buildings": found, "attribution": data.attribution}))
+        console.show_json({"file": str(out), "buildings": count, "attribution": data.attribution})
     else:
-        click.echo(f"{out}: {found} buildings. {data.attribution}")
+        console.show(f"{out}: {count} buildings. {data.attribution}\n")
 
 
 @command.command(epilog="Example: lslam osm show town.osm --png town.png")
 @click.argument("file", type=click.Path(path_type=Path))
-@click.option("--png", type=click.Path(path_type=Path), metavar="FILE.png", help="Draw the buildings from above.")
-@click.option("--origin", metavar="LAT,LON[,H]", help="Where x = y = 0 is  [the middle of the buildings].")
-@click.option("--overwrite", is_flag=True, help="Replace FILE.png.")
+@options.path("--png", "FILE.png", "Draw the buildings from above.")
+@options.option("--origin", "LAT,LON[,H]", "Where x = y = 0 is  [the middle of the buildings].")
+@options.flag("--overwrite", "Replace FILE.png.")
 @options.as_json
 def show(file: Path, png: Path | None, origin: str | None, overwrite: bool, as_json: bool) -> None:
     """Show what is in FILE: OSM XML, a stored Overpass reply, or GeoJSON outlines."""
@@ -170,11 +138,11 @@ def show(file: Path, png: Path | None, origin: str | None, overwrite: bool, as_j
     at = None if origin is None else [*options.place("--origin", origin), 0.0][:3]
     import numpy as np
 
-    from lslam.core.errors import OutputExistsError
     from lslam.io.formats.osm_buildings import read_buildings
+    from lslam.pipeline.run_folder import require_new
 
-    if png is not None and png.exists() and not overwrite:
-        raise OutputExistsError(f"{png} exists: give --overwrite to replace it, or another --png")
+    if png is not None:
+        require_new(png, overwrite, "--png")
     data, extract = read_buildings(file, None if at is None else np.array(at))
     facts = _facts(extract)
     facts["elements"] = {"nodes": len(data.nodes), "ways": len(data.ways), "relations": len(data.relations)}
@@ -183,9 +151,7 @@ def show(file: Path, png: Path | None, origin: str | None, overwrite: bool, as_j
 
         write_buildings_png(png, extract)
     if as_json:
-        import json
-
-        click.echo(json.dumps(facts, indent=1, allow_nan=False, ensure_ascii=False))
+        console.show_json(facts, indent=1, ensure_ascii=False)
     else:
         _print(facts, png)
 
@@ -221,7 +187,7 @@ def _print(facts: dict[str, Any], png: Path | None) -> None:
     elements = facts["elements"]
     (south, west), (north, east), (width, depth) = facts["south_west"], facts["north_east"], facts["size_m"]
     left_out = ", ".join(f"{count} x {why}" for why, count in facts["left_out"].items())
-    lines = [
+    rows = [
         ("extract", facts["file"]),
         ("elements", ", ".join(f"{count} {kind}" for kind, count in elements.items())),
         (
@@ -237,6 +203,4 @@ def _print(facts: dict[str, Any], png: Path | None) -> None:
         ("origin", ",".join(f"{v:.7g}" if k == 2 else f"{v:.7f}" for k, v in enumerate(facts["origin_lat_lon_alt"]))),
         ("licence", facts["attribution"] or "none is given"),
     ]
-    lines += [("picture", str(png))] if png is not None else []
-    for label, value in lines:
-        click.echo(f"{label:<10} {value}")
+    console.show_rows([*rows, *([("picture", str(png))] if png is not None else [])])

@@ -9,7 +9,6 @@ import click
 
 from lslam.cli import options
 from lslam.cli.console import setup_logging, show
-from lslam.core.errors import OutputExistsError
 
 
 @click.command(
@@ -18,13 +17,13 @@ from lslam.core.errors import OutputExistsError
     "          lslam plot runs/loam --what features --font 7 --out features.svg"
 )
 @click.argument("run", metavar="RUN", type=click.Path(path_type=Path))
-@click.option("--what", metavar="NAME", required=True, help="map, trajectory, errors, features, imu or buildings.")
-@click.option("--out", type=click.Path(path_type=Path), metavar="FILE", required=True, help="A .png, .svg or .pdf.")
-@click.option("--width", default="column", metavar="WORD|MM", help="column (89 mm), page (182 mm) or mm  [column].")
-@click.option("--font", type=float, default=8.0, metavar="PT", help="Size of the text  [8].")
+@options.option("--what", "NAME", "map, trajectory, errors, features, imu or buildings.", required=True)
+@options.path("--out", "FILE", "A .png, .svg or .pdf.", required=True)
+@options.option("--width", "WORD|MM", "column (89 mm), page (182 mm) or mm  [column].", default="column")
+@options.real("--font", "PT", "Size of the text  [8].", default=8.0)
 @options.truth
-@options.moved_sequence
-@click.option("--overwrite", is_flag=True, help="Replace an existing file.")
+@options.new_sequence
+@options.flag("--overwrite", "Replace an existing file.")
 @options.reading
 @options.verbosity
 def command(run: Path, **given: Any) -> None:
@@ -37,18 +36,17 @@ def command(run: Path, **given: Any) -> None:
     out: Path = given["out"]
     options.require_there(given["gt"])
     from lslam.cli.one_run import read_truth
-    from lslam.pipeline.plot_run import plotted_run, width_of, write_figure
+    from lslam.pipeline.again import gather_figure, width_of, write_figure
+    from lslam.pipeline.run_folder import require_new
     from lslam.reports.figures import require_figure
     from lslam.reports.picture import check_plot_path
 
-    require_figure(given["what"])
+    what = given["what"]
+    require_figure(what)
     check_plot_path(out)
     width = width_of(given["width"])
-    if out.exists() and not given["overwrite"]:
-        raise OutputExistsError(f"{out} exists; name another file with --out or replace it with --overwrite")
+    require_new(out, given["overwrite"])
     reading = options.reading_of(given)
-    drawn = plotted_run(
-        run, given["what"], given["sequence"], lambda opened: read_truth(given["gt"], opened), **reading
-    )
-    write_figure(drawn, given["what"], out, width, given["font"])
+    parts = gather_figure(run, what, given["sequence"], lambda recording: read_truth(given["gt"], recording), **reading)
+    write_figure(parts, what, out, width, given["font"])
     show(f"{out}\n")

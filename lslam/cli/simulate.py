@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import shlex
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,235 +11,158 @@ import click
 from lslam.cli import console, options
 
 if TYPE_CHECKING:
-    from lslam.simulation.plan import ScenePlan
+    from lslam.core.types.arrays import Floats
+    from lslam.simulation.city import City
     from lslam.simulation.scenarios import SimulatedDrive
+    from lslam.simulation.scene_mesh import RayScene
 
 
 @click.command(epilog="Example: lslam simulate block --out town && lslam run town")
 @click.argument("scenario", required=False)
-@click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="Folder to write; must not exist.")
-@click.option(
-    "--seed", type=int, default=0, show_default=True, metavar="N", help="Seed of the town, the drive and the noise."
-)
-@click.option("--lidar", metavar="NAME", help="The sensor; see --list.")
-@click.option(
-    "--scans",
-    "--count",
-    "count",
-    type=int,
-    metavar="N",
-    help="Number of scans [default: one lap, or the whole street].",
-)
-@click.option("--speed", type=float, metavar="M/S", help="Cruising speed; bends may need less.")
+@options.path("--out", "DIR", "Folder to write; must not exist.")
+@options.integer("--seed", "N", "Seed of the town, the drive and the noise.", default=0, show_default=True)
+@options.option("--lidar", "NAME", "The sensor; see --list.")
+@options.integer("--scans", "--count", "count", "N", "Number of scans [default: one lap, or the whole street].")
+@options.real("--speed", "M/S", "Cruising speed; bends may need less.")
 @click.option(
     "--distorted/--compensated",
-    "distorted",
+    "motion_in_scans",
     default=None,
     help="Cast the rays while the sensor moves, with per-point times, or all from one pose [default: the scenario's].",
 )
-@click.option(
+@options.path(
     "--path",
     "path_file",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="Drive along way-points (.toml, .csv, .geojson) or a trajectory's shape [SCENARIO then is residential].",
+    "FILE",
+    "Drive along way-points (.toml, .csv, .geojson) or a trajectory's shape [SCENARIO then is residential].",
 )
-@click.option(
+@options.path(
     "--osm",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="Build the city of an OpenStreetMap extract (.osm or Overpass JSON) and drive along --path, else its streets.",
+    "FILE",
+    "Build the city of an OpenStreetMap extract (.osm or Overpass JSON) and drive along --path, else its streets.",
 )
-@click.option(
+@options.option(
     "--origin",
-    metavar="LAT,LON[,H]",
-    help="Where x = y = 0 of the city lies [default: the extract's middle, or a GeoJSON path's first point].",
+    "LAT,LON[,H]",
+    "Where x = y = 0 of the city lies [default: the extract's middle, or a GeoJSON path's first point].",
 )
-@click.option(
-    "--set",
-    "settings",
-    multiple=True,
-    metavar="KEY=VALUE",
-    help="Set one key of the scenario, for example world.relief=1; repeatable.",
-)
-@click.option(
-    "--plan",
-    type=click.Path(path_type=Path),
-    metavar="FILE.png",
-    help="Draw the scene from above with a metric grid, a scale and a legend.",
-)
+@options.settings("KEY=VALUE", "Set one key of the scenario, for example world.relief=1; repeatable.")
+@options.path("--plan", "FILE.png", "Draw the scene from above with a metric grid, a scale and a legend.")
 @click.option("--imu/--no-imu", default=True, show_default=True, help="Record an ICM-20948 at 100 Hz.")
-@click.option("--imu-model", metavar="NAME", default="icm20948", show_default=True, help="Another IMU; see --list.")
-@click.option(
-    "--gnss-rate", type=float, default=1.0, show_default=True, metavar="HZ", help="Satellite fixes, 1 to 10; 0: none."
-)
-@click.option(
-    "--gnss-outage", type=(float, float), multiple=True, metavar="FROM TO", help="Seconds without fixes; repeatable."
-)
+@options.option("--imu-model", "NAME", "Another IMU; see --list.", default="icm20948", show_default=True)
+@options.real("--gnss-rate", "HZ", "Satellite fixes, 1 to 10; 0: none.", default=1.0, show_default=True)
+@options.option("--gnss-outage", "FROM TO", "Seconds without fixes; repeatable.", type=(float, float), multiple=True)
 @click.option(
     "--wheels/--no-wheels", default=True, show_default=True, help="Record speed and yaw rate of a car's wheels."
 )
-@click.option(
-    "--visit",
-    type=int,
-    default=0,
-    metavar="N",
-    help="Drive there again, N-th time: other traffic and noise, the same town.",
-)
-@click.option("--reverse", is_flag=True, help="Drive in the opposite direction, on the other lane.")
-@click.option("--from", "shift", type=float, default=0.0, metavar="M", help="Begin so far along the line.")
-@click.option("--static-start", type=float, default=0.0, metavar="S", help="Stay at the start for S seconds first.")
-@click.option("--labels", "has_labels", is_flag=True, help="Write the class of every point, as SemanticKITTI has it.")
-@click.option("--camera", "is_filmed", is_flag=True, help="Record a camera that looks ahead, one image a scan.")
-@click.option("--overwrite", is_flag=True, help="Replace sequences/00 and poses/00.txt in an existing folder.")
-@click.option("--resume", is_flag=True, help="Continue an interrupted simulation.")
-@click.option("--show", is_flag=True, help="Print SCENARIO with all its keys as TOML.")
-@click.option("--list", "show_list", is_flag=True, help="List scenarios and sensors.")
+@options.integer("--visit", "N", "Drive there again, N-th time: other traffic and noise, the same town.", default=0)
+@options.flag("--reverse", "Drive in the opposite direction, on the other lane.")
+@options.real("--from", "shift", "M", "Begin so far along the line.", default=0.0)
+@options.real("--static-start", "S", "Stay at the start for S seconds first.", default=0.0)
+@options.flag("--labels", "with_labels", "Write the class of every point, as SemanticKITTI has it.")
+@options.flag("--camera", "with_camera", "Record a camera that looks ahead, one image a scan.")
+@options.flag("--overwrite", "Replace sequences/00 and poses/00.txt in an existing folder.")
+@options.flag("--resume", "Continue an interrupted simulation.")
+@options.flag("--show", "Print SCENARIO with all its keys as TOML.")
+@options.flag("--list", "show_list", "List scenarios and sensors.")
 @options.as_json
 @options.verbosity
-def command(
-    scenario: str | None,
-    out: Path | None,
-    seed: int,
-    lidar: str | None,
-    count: int | None,
-    speed: float | None,
-    distorted: bool | None,
-    path_file: Path | None,
-    osm: Path | None,
-    origin: str | None,
-    settings: tuple[str, ...],
-    plan: Path | None,
-    imu: bool,
-    imu_model: str,
-    gnss_rate: float,
-    gnss_outage: tuple[tuple[float, float], ...],
-    wheels: bool,
-    visit: int,
-    reverse: bool,
-    shift: float,
-    static_start: float,
-    has_labels: bool,
-    is_filmed: bool,
-    overwrite: bool,
-    resume: bool,
-    show: bool,
-    show_list: bool,
-    as_json: bool,
-    verbose: bool,
-    quiet: bool,
-) -> None:
+def command(scenario: str | None, out: Path | None, plan: Path | None, osm: Path | None, **given: Any) -> None:
     """Simulate a drive or a flight with exact ground truth; SCENARIO is a name of --list, or a .toml file.
 
     With --plan the scene is drawn, and recorded only with --out as well. With --osm and without --path the whole extract is
     drawn. Further LiDARs of a vehicle are the scenario's `lidars`, see `lslam simulate two-lidars --show`.
     """
-    if show_list:
+    as_json, path_file, settings = given["as_json"], given["path_file"], given["settings"]
+    if given["show_list"]:
         _print_list(as_json)
         return
     if scenario is None and (path_file is not None or osm is not None):
         scenario = "residential"
-    if show and scenario is not None:
+    if given["show"] and scenario is not None:
         _print_scenario(scenario, settings, as_json)
         return
     if scenario is None or (out is None and plan is None):
         missing = "SCENARIO" if scenario is None else "--out DIR"
         raise click.UsageError(f"{missing} is missing; for example: lslam simulate block --out town")
-    if overwrite and resume:
+    if given["overwrite"] and given["resume"]:
         raise click.UsageError("--overwrite begins anew and --resume goes on: give one of them")
     if plan is not None and plan.suffix.lower() != ".png":
         raise click.UsageError(f"--plan {plan}: the scene is drawn as PNG, name a file FILE.png")
-    console.setup_logging(verbose, quiet)
+    console.setup_logging(given["verbose"], given["quiet"])
     from lslam.simulation import check_target
 
     if out is not None:
-        check_target(out, overwrite, resume)
-    at = None if origin is None else _numbers(origin)
+        check_target(out, given["overwrite"], given["resume"])
+    example = "LAT,LON or LAT,LON,HEIGHT, for example 49.0112,8.4229"
+    origin = None if given["origin"] is None else options.numbers("--origin", given["origin"], (2, 3), example)
     from lslam.simulation.routes import Visit
     from lslam.simulation.scenarios import simulate
     from lslam.simulation.sensors import GnssModel, WheelModel
 
     if plan is not None and out is None and osm is not None and path_file is None:
-        _print([_draw_map(scenario, seed, settings, osm, at, plan)], as_json)
+        _print([_draw_map(scenario, given["seed"], settings, osm, origin, plan)], as_json)
         return
     drive = simulate(
         scenario,
-        seed=seed,
-        lidar=lidar,
-        count=count,
-        speed=speed,
-        motion_compensated=None if distorted is None else not distorted,
-        settings=settings,
+        **{name: given[name] for name in ("seed", "lidar", "count", "speed", "settings", "static_start")},
+        motion_compensated=None if given["motion_in_scans"] is None else not given["motion_in_scans"],
         way_points=path_file,
         osm=osm,
-        origin=at,
-        imu=imu_model if imu else None,
-        gnss=GnssModel(gnss_rate, outages=gnss_outage) if gnss_rate else None,
-        wheels=WheelModel() if wheels else None,
-        static_start=static_start,
-        visit=Visit(visit, reverse, shift),
+        origin=origin,
+        imu=given["imu_model"] if given["imu"] else None,
+        gnss=GnssModel(given["gnss_rate"], outages=given["gnss_outage"]) if given["gnss_rate"] else None,
+        wheels=WheelModel() if given["wheels"] else None,
+        visit=Visit(given["visit"], given["reverse"], given["shift"]),
     )
-    written = []
+    results = []
     if plan is not None:
-        written.append(_draw(drive, plan))
+        results.append(_write_plan(plan, drive.scene, drive.city, drive.city_poses[:, :3, 3]))
     if out is not None:
-        written.append(record_drive(drive, out, overwrite, resume, has_labels, is_filmed))
-    _print(written, as_json)
+        how = {name: given[name] for name in ("overwrite", "resume", "with_labels", "with_camera")}
+        results.append(record_drive(drive, out, **how))
+    _print(results, as_json)
 
 
 @dataclass(frozen=True)
-class Written:
+class SimulationFile:
     """One thing that was written: a line for people, and the same as values by key for programs."""
 
     text: str
     values: dict[str, Any]
 
 
-def _print(written: list[Written], as_json: bool) -> None:
+def _print(results: list[SimulationFile], as_json: bool) -> None:
     if as_json:
-        click.echo(json.dumps({key: value for one in written for key, value in one.values.items()}))
+        console.show_json({key: value for one in results for key, value in one.values.items()})
     else:
-        click.echo("\n".join(one.text for one in written))
-
-
-def _numbers(origin: str) -> list[float]:
-    try:
-        return [float(part) for part in origin.split(",")]
-    except ValueError:
-        raise click.UsageError(
-            f"--origin {origin}: expected LAT,LON or LAT,LON,HEIGHT, for example 49.0112,8.4229"
-        ) from None
-
-
-def _draw(drive: SimulatedDrive, plan: Path) -> Written:
-    from lslam.simulation.plan import plan_of
-
-    return _write_plan(plan, plan_of(drive.scene, drive.city, drive.city_poses[:, :3, 3]))
+        console.show("".join(f"{one.text}\n" for one in results))
 
 
 def _draw_map(
     scenario: str, seed: int, settings: tuple[str, ...], osm: Path, origin: list[float] | None, plan: Path
-) -> Written:
+) -> SimulationFile:
     """Draw the whole extract, with the street of the drive when there is one."""
     from lslam.simulation.built_scenario import whole_map
     from lslam.simulation.osm_place import read_extract
-    from lslam.simulation.plan import plan_of
     from lslam.simulation.scenario_files import find_scenario
     from lslam.simulation.scenarios import checked_origin
     from lslam.simulation.scene_mesh import RayScene
 
     extract = read_extract(osm, None if origin is None else checked_origin(origin))
     city, line = whole_map(find_scenario(scenario, settings), seed, extract)
-    return _write_plan(plan, plan_of(RayScene(city.mesh), city, line))
+    return _write_plan(plan, RayScene(city.mesh), city, line)
 
 
-def _write_plan(path: Path, plan: ScenePlan) -> Written:
+def _write_plan(path: Path, scene: RayScene, city: City, line: Floats) -> SimulationFile:
     from lslam.reports.plans import write_plan
+    from lslam.simulation.plan import plan_of
 
+    plan = plan_of(scene, city, line)
     write_plan(path, plan)
     width, depth = plan.high - plan.low
     text = f"{path}: {width:.0f} x {depth:.0f} m, a line every 10 m"
-    return Written(text, {"plan": str(path), "plan_size_m": [float(width), float(depth)]})
+    return SimulationFile(text, {"plan": str(path), "plan_size_m": [float(width), float(depth)]})
 
 
 def record_drive(
@@ -250,14 +170,14 @@ def record_drive(
     out: Path,
     overwrite: bool,
     resume: bool = False,
-    has_labels: bool = False,
-    is_filmed: bool = False,
-) -> Written:
+    with_labels: bool = False,
+    with_camera: bool = False,
+) -> SimulationFile:
     """Record the drive in `out` with a progress bar, until a signal comes; arguments as of the command."""
     from lslam.core.stopping import handle_signals
     from lslam.simulation.record import record
 
-    with handle_signals() as stop, console.progress("simulating", len(drive) * (1 + is_filmed)) as advance:
+    with handle_signals() as stop, console.progress("simulating", len(drive) * (1 + with_camera)) as advance:
 
         def on_scan(index: int) -> None:
             advance()
@@ -268,28 +188,26 @@ def record_drive(
             advance()
             stop.check()
 
-        command = shlex.join(["lslam", *sys.argv[1:]])
-        done = record(drive, out, overwrite, on_scan, resume, command, has_labels, on_image if is_filmed else None)
+        command, images = options.command_line(), on_image if with_camera else None
+        recording = record(drive, out, overwrite, on_scan, resume, command, with_labels, images)
     assert drive.ground_truth is not None
     length = float(drive.ground_truth.path_lengths[-1])
-    return Written(
-        f"{done.sequence}: {len(drive)} scans, {length:.1f} m, {done.points / len(drive):.0f} points per scan, "
-        f"{done.size / 1e6:.1f} MB",
-        {
-            "sequence": str(done.sequence),
-            "scans": len(drive),
-            "path_length_m": length,
-            "points_per_scan": done.points / len(drive),
-            "bytes": done.size,
-        },
+    points, size = recording.points / len(drive), recording.size
+    values = {"sequence": str(recording.sequence), "scans": len(drive), "path_length_m": length}
+    text = (
+        f"{recording.sequence}: {len(drive)} scans, {length:.1f} m, {points:.0f} points per scan, {size / 1e6:.1f} MB"
     )
+    return SimulationFile(text, {**values, "points_per_scan": points, "bytes": size})
 
 
 def _print_scenario(name: str, settings: tuple[str, ...], as_json: bool) -> None:
     from lslam.simulation.scenario_files import find_scenario, scenario_text
 
     text = scenario_text(find_scenario(name, settings))
-    click.echo(json.dumps({"scenario": name, "toml": text}) + "\n" if as_json else text, nl=False)
+    if as_json:
+        console.show_json({"scenario": name, "toml": text})
+    else:
+        console.show(text)
 
 
 def _print_list(as_json: bool) -> None:
@@ -297,13 +215,11 @@ def _print_list(as_json: bool) -> None:
     from lslam.simulation.lidar_models import LIDARS
     from lslam.simulation.scenario_files import find_scenario, scenario_names
 
+    scenarios = {name: find_scenario(name).summary for name in scenario_names()}
     if as_json:
-        names = {name: find_scenario(name).summary for name in scenario_names()}
-        click.echo(json.dumps({"scenarios": names, "lidars": list(LIDARS), "imus": list(IMUS)}))
+        console.show_json({"scenarios": scenarios, "lidars": list(LIDARS), "imus": list(IMUS)})
         return
-    for name in scenario_names():
-        click.echo(f"scenario  {name:<16}  {find_scenario(name).summary}")
-    for name, model in LIDARS.items():
-        click.echo(f"lidar     {name:<16}  {model.rings} x {model.columns} rays, {model.range_max:g} m")
-    for name, imu in IMUS.items():
-        click.echo(f"imu       {name:<16}  {imu.rate_hz:g} Hz, {'without errors' if name == 'ideal' else 'MEMS'}")
+    lidars = {n: f"{lidar.rings} x {lidar.columns} rays, {lidar.range_max:g} m" for n, lidar in LIDARS.items()}
+    imus = {n: f"{imu.rate_hz:g} Hz, {'without errors' if n == 'ideal' else 'MEMS'}" for n, imu in IMUS.items()}
+    for kind, texts in (("scenario", scenarios), ("lidar", lidars), ("imu", imus)):
+        console.show("".join(f"{kind:<9} {name:<16}  {text}\n" for name, text in texts.items()))

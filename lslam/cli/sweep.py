@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from contextlib import ExitStack
 from math import isnan
@@ -12,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lslam.cli import options
-from lslam.cli.console import log, setup_logging, show
+from lslam.cli.console import log, setup_logging, show, show_json
 
 if TYPE_CHECKING:
     from lslam.core.types.study import StudyRow
-    from lslam.studies.sweep import Sweep
+    from lslam.studies.study_runs import Sweep
 
 
 @click.command(
@@ -27,23 +26,16 @@ if TYPE_CHECKING:
     "          lslam sweep --report runs/shares"
 )
 @click.argument("study", required=False)
-@click.option("--list", "show_list", is_flag=True, help="List the studies that ship with lslam.")
-@click.option(
-    "--dry-run", is_flag=True, help="List and count the runs, estimate their time by finished ones, and stop."
-)
-@click.option("--pilot", is_flag=True, help="With --dry-run: estimate the time by a few short runs.")
-@options.studied
-@click.option(
-    "--report",
-    type=click.Path(path_type=Path),
-    metavar="DIR",
-    help="Write the report of the study in DIR anew from its results.csv, run nothing.",
-)
+@options.flag("--list", "show_list", "List the studies that ship with lslam.")
+@options.flag("--dry-run", "List and count the runs, estimate their time by finished ones, and stop.")
+@options.flag("--pilot", "With --dry-run: estimate the time by a few short runs.")
+@options.study_output
+@options.path("--report", "DIR", "Write the report of the study in DIR anew from its results.csv, run nothing.")
 @options.engine
-@click.option("--seeds", metavar="N,N,...", help="Seeds instead of the study's.")
+@options.option("--seeds", "N,N,...", "Seeds instead of the study's.")
 @options.data_root
 @options.set_in_all_runs
-@click.option("--strict", is_flag=True, help="Exit 4 when any run failed or diverged.")
+@options.flag("--strict", "Exit 4 when any run failed or diverged.")
 @options.as_json
 @options.verbosity
 def command(study: str | None, **given: Any) -> None:
@@ -70,7 +62,7 @@ def command(study: str | None, **given: Any) -> None:
     options.check_engine(given)
     sweep = _sweep(study, given)
     from lslam.core.errors import GateError
-    from lslam.studies.sweep import run_sweep
+    from lslam.studies.study_runs import run_sweep
 
     with options.engine_of(given, "studying") as engine, ExitStack() as stack:
         from lslam.cli.console import bars, best_so_far
@@ -82,14 +74,10 @@ def command(study: str | None, **given: Any) -> None:
         rows = run_sweep(sweep, engine, bars(stack), on_rows)
     if not given["as_json"]:
         _print(rows)
-    unscored = [row for row in rows if row.is_usable and isnan(row.error)]
-    if unscored:
-        log.warning(
-            "%d of %d runs have no score, the first one: %s",
-            len(unscored),
-            len(rows),
-            unscored[0].reason or "its metric is not available",
-        )
+    without = [row for row in rows if row.is_usable and isnan(row.error)]
+    if without:
+        reason = without[0].reason or "its metric is not available"
+        log.warning("%d of %d runs have no score, the first one: %s", len(without), len(rows), reason)
     log.info("every run: %s", sweep.output.out / "results.csv")
     _print_verdicts(_report(sweep.output.out), sweep.output.out, rows, given["as_json"])
     failed = [row for row in rows if not row.is_usable]
@@ -102,8 +90,7 @@ def _sweep(word: str, given: dict[str, Any]) -> Sweep:
     seeds = None if given["seeds"] is None else options.seeds_of(given["seeds"])
     from lslam.core.config.config import check_settings
     from lslam.core.config.study import parse_study
-    from lslam.studies.output import STUDY, require_free
-    from lslam.studies.study_files import find_study
+    from lslam.studies.options import STUDY, find_study, require_free
 
     check_settings(given["settings"])
     study = find_study(word)
@@ -111,8 +98,7 @@ def _sweep(word: str, given: dict[str, Any]) -> Sweep:
         study = parse_study(study.model_dump(exclude_unset=True) | {"seeds": seeds}, "--seeds", study.name)
     output = options.output_of(given, study.name)
     if not given["dry_run"]:
-        require_free(output.out, STUDY, "study", output.overwrite, output.resume)
-    from lslam.studies.sweep import Sweep
+        require_free(output, STUDY)
 
     return Sweep(study, output, given["settings"])
 
@@ -127,7 +113,7 @@ def _print(rows: list[StudyRow]) -> None:
 def _report(folder: Path) -> list[str]:
     """Write the report. Returns the sentences of its verdicts."""
     options.require_there(folder / "results.csv")
-    from lslam.studies.sweep import report_folder
+    from lslam.studies.study_runs import report_folder
 
     verdicts = [verdict.sentence for result in report_folder(folder) for verdict in result.verdicts]
     log.info("report: %s", folder / "report.html")
@@ -144,42 +130,42 @@ def _print_verdicts(verdicts: list[str], folder: Path, rows: list[StudyRow] | No
 
         document["runs"] = rows_document(rows)
     document["verdicts"] = verdicts
-    show(json.dumps(document) + "\n")
+    show_json(document)
 
 
 def _print_list(as_json: bool) -> None:
-    from lslam.studies.study_files import find_study, study_names
+    from lslam.studies.options import find_study, study_names
 
+    summaries = {name: find_study(name).summary for name in study_names()}
     if as_json:
-        show(json.dumps({"studies": {name: find_study(name).summary for name in study_names()}}) + "\n")
-        return
-    for name in study_names():
-        show(f"{name:<22}  {find_study(name).summary}\n")
+        show_json({"studies": summaries})
+    else:
+        show("".join(f"{name:<22}  {summary}\n" for name, summary in summaries.items()))
 
 
-def _print_plan(sweep: Sweep, at_once: int, is_piloted: bool, stack: ExitStack, as_json: bool) -> None:
+def _print_plan(sweep: Sweep, at_once: int, by_pilots: bool, stack: ExitStack, as_json: bool) -> None:
     """Print every run, their number, and the estimated time of those that are not finished."""
     from lslam.cli.console import bars
-    from lslam.studies.estimate import estimate, from_finished
-    from lslam.studies.expanded_study import left_to_do
-    from lslam.studies.sweep import expand_study
+    from lslam.studies.estimate import estimate, extrapolate
+    from lslam.studies.jobs import left_to_do
+    from lslam.studies.study_runs import expand_study
 
-    expanded = expand_study(sweep)
-    left = left_to_do(sweep.output, expanded.jobs)
-    many = f"{len(expanded.jobs)} runs, {len(left)} left to do"
+    study = expand_study(sweep)
+    rest = left_to_do(sweep.output, study.jobs)
+    summary = f"{len(study.jobs)} runs, {len(rest)} left to do"
     if not as_json:
-        show("".join(f"{job.name}\n" for job in expanded.jobs))
-    if left and is_piloted:
-        guess = estimate(left, expanded.variants, at_once, bars(stack), time.process_time())
-        many += f": about {guess.text}, {at_once} at once ({guess.pilots} pilot runs)"
-    elif left:
-        earlier = from_finished(expanded.jobs, left, expanded.variants, at_once)
+        show("".join(f"{job.name}\n" for job in study.jobs))
+    if rest and by_pilots:
+        guess = estimate(rest, study.variants, at_once, bars(stack), time.process_time())
+        summary += f": about {guess.text}, {at_once} at once ({guess.pilots} pilot runs)"
+    elif rest:
+        earlier = extrapolate(study.jobs, rest, study.variants, at_once)
         if earlier is None:
-            many += "; --pilot estimates their time by a few short runs"
+            summary += "; --pilot estimates their time by a few short runs"
         else:
-            many += f": about {earlier.text}, {at_once} at once (as the finished ones took)"
+            summary += f": about {earlier.text}, {at_once} at once (as the finished ones took)"
     if as_json:
-        names = {"runs": [job.name for job in expanded.jobs], "left_to_do": [job.name for job in left]}
-        show(json.dumps(names | {"summary": many}) + "\n")
+        names = {"runs": [job.name for job in study.jobs], "left_to_do": [job.name for job in rest]}
+        show_json(names | {"summary": summary})
     else:
-        show(f"{many}\n")
+        show(f"{summary}\n")

@@ -33,10 +33,10 @@ Examples:
 
 @click.command(help=HELP, epilog=EPILOG)
 @click.argument("run", metavar="RUN", type=click.Path(path_type=Path))
-@click.option("--port", type=click.IntRange(0, 65535), metavar="N", help="Port of the server  [any that is free].")
-@click.option("--no-browser", is_flag=True, help="Print the address, and open no browser.")
-@click.option("--rerun", type=click.Path(path_type=Path), metavar="FILE", help="Write a recording for rerun, and end.")
-@click.option("--overwrite", is_flag=True, help="Replace a recording that is there.")
+@options.option("--port", "N", "Port of the server  [any that is free].", type=click.IntRange(0, 65535))
+@options.flag("--no-browser", "Print the address, and open no browser.")
+@options.path("--rerun", "FILE", "Write a recording for rerun, and end.")
+@options.flag("--overwrite", "Replace a recording that is there.")
 @options.verbosity
 def command(
     run: Path, port: int | None, no_browser: bool, rerun: Path | None, overwrite: bool, verbose: bool, quiet: bool
@@ -55,20 +55,19 @@ def command(
 
 def record(run: Path, path: Path, overwrite: bool) -> None:
     """Write the recording."""
-    from lslam.core.errors import OutputError, OutputExistsError
-    from lslam.pipeline.run_folder import require_run
+    from lslam.core.errors import OutputError
+    from lslam.pipeline.run_folder import require_new, require_run
     from lslam.reports.figures import require_rerun, write_recording
 
     require_rerun()
-    if path.exists() and not overwrite:
-        raise OutputExistsError(f"{path} exists; name another file with --rerun or replace it with --overwrite")
+    require_new(path, overwrite, "--rerun")
     require_run(run)
-    from lslam.pipeline.rebuild import viewed_run
+    from lslam.pipeline.again import view_run
 
-    viewed = viewed_run(run)
+    content = view_run(run)
     if not path.parent.is_dir():
         raise OutputError(f"{path} cannot be written: the folder {path.parent} does not exist")
-    write_recording(path, viewed)
+    write_recording(path, content)
     show(f"{path}\n")
 
 
@@ -78,9 +77,8 @@ def serve(run: Path, port: int, opens: bool) -> None:
     from lslam.pipeline.run_folder import require_run
 
     require_run(run)
-    from lslam.pipeline.view.page import require_one_run, require_page
     from lslam.pipeline.view.server import RunServer
-    from lslam.pipeline.view.sites import ViewedSites
+    from lslam.pipeline.view.sites import ViewedSites, require_one_run, require_page
 
     require_one_run(run)
     require_page(run)

@@ -1,24 +1,43 @@
-"""A run made again from its folder alone: what it was made of, what is other today, and whether its files came out the same."""
+"""An earlier run taken up again: made once more by its folder alone, with another pose graph, or drawn."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import logging
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from lslam.core import __version__
 from lslam.core.config import Config, load_config
-from lslam.core.errors import InputError, input_errors
+from lslam.core.errors import InputError, UsageError, input_errors
+from lslam.core.types.cloud import ArrayCloud
 from lslam.core.types.sequence import Sequence, select
 from lslam.core.types.trajectory import Trajectory
 from lslam.core.untrusted import MISFIT, parse_json
+from lslam.evaluation.evaluate import evaluate
+from lslam.io.formats.atomic import atomic_write
+from lslam.io.formats.point_files import read_cloud
+from lslam.io.formats.trajectory_files import read_trajectory
 from lslam.io.remote import as_path
+from lslam.odometry import create_odometry
+from lslam.odometry.base import FeatureSource
+from lslam.osm.buildings_geojson import read_buildings_geojson
 from lslam.osm.source import AUTO
+from lslam.pipeline.check import open_recording
+from lslam.pipeline.further_passes import view_features
+from lslam.pipeline.job import choose_scans
 from lslam.pipeline.manifest import machine_facts
+from lslam.pipeline.map_files import in_own_world
+from lslam.pipeline.rebuild import EarlierRun, is_missing, map_of, read_run, recording_of, results_of
 from lslam.pipeline.resume import INPUTS, input_digest
-from lslam.pipeline.run_folder import MANIFEST, OURS, REPLIES, require_run
+from lslam.pipeline.run_folder import MANIFEST, OURS, REPLIES, require_odometry, require_run
+from lslam.reports.figures import ON_THE_MAP, WIDTHS, PlottedRun, draw_figure, require_figure
+from lslam.reports.picture import check_plot_path, house_style, picture
 
+log = logging.getLogger("lslam")
+# Sections that odometry does not look at.
+FREE_SECTIONS = ("loops", "graph", "gnss", "osm", "map", "eval", "report")
 # Options with which a recording is opened.
 READING = ("lidar_topic", "lidar_frame", "imu_topic", "gnss_topic", "point_times", "extrinsics")
 # Files that hold times or the names of folders.
@@ -30,7 +49,7 @@ class Recipe:
     """What a run was made of.
 
     path : of its recording; reading : options with which that was opened; truth : file of `--gt`, None without
-    identity : digests of its input, as of `run_identity`; has_moved : whether `path` is another than that of the run
+    identity : digests of its input, as of `run_identity`; is_elsewhere : whether `path` is another than that of the run
     notes : sentences about what cannot be as it was
     """
 
@@ -41,12 +60,12 @@ class Recipe:
     reading: Mapping[str, str]
     truth: Path | None
     identity: Mapping[str, str]
-    has_moved: bool = False
+    is_elsewhere: bool = False
     notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
-class ComparedResults:
+class ResultComparison:
     """Names of result files that are the same in both runs, that differ, and that one of them lacks."""
 
     same: list[str] = field(default_factory=list)
@@ -74,8 +93,8 @@ def read_recipe(folder: Path, recording: Path | None = None) -> Recipe:
                 f"{folder} is a merge of several runs: make it again by its command, {manifest['command']}"
             )
         section = manifest["sequence"]
-        path, told = str(section["path"]), section.get("reading", {})
-        reading = {name: str(told[name]) for name in READING if name in told}
+        path, own = str(section["path"]), section.get("reading", {})
+        reading = {name: str(own[name]) for name in READING if name in own}
         truth = None if manifest.get("ground_truth") is None else Path(manifest["ground_truth"])
         identity = {name: str(digest) for name, digest in manifest.get("identity", {}).items()}
     except (AttributeError, *MISFIT) as error:
@@ -89,18 +108,18 @@ def read_recipe(folder: Path, recording: Path | None = None) -> Recipe:
     if config.osm.extract == AUTO:
         # What the server said then stands in the run; today it may say something else.
         replies = (folder / REPLIES).absolute()
-        known: dict[str, str | None] = {"extract": str(replies)}
+        buildings: dict[str, str | None] = {"extract": str(replies)}
         if not any(replies.glob("*.json")):
             notes.append(f"the run in {folder} had no reply of the server of --osm auto: it is made without buildings")
-            known = {"extract": "", "origin": None, "heading_deg": None}
-        config = config.model_copy(update={"osm": config.osm.model_copy(update=known)})
+            buildings = {"extract": "", "origin": None, "heading_deg": None}
+        config = config.model_copy(update={"osm": config.osm.model_copy(update=buildings)})
     place = as_path(path) if recording is None else recording
     if not place.exists():
         raise InputError(
             f"the recording of {folder} is gone: {place} does not exist; say where it is: lslam run RECORDING --again {folder}"
         )
-    has_moved = recording is not None and recording.absolute() != Path(path)
-    return Recipe(folder, manifest, config, place, reading, truth, identity, has_moved, tuple(notes))
+    is_elsewhere = recording is not None and recording.absolute() != Path(path)
+    return Recipe(folder, manifest, config, place, reading, truth, identity, is_elsewhere, tuple(notes))
 
 
 def other_programs(recipe: Recipe) -> list[str]:
@@ -109,34 +128,34 @@ def other_programs(recipe: Recipe) -> list[str]:
     before = {"lslam": recipe.manifest.get("lslam"), **(then if isinstance(then, dict) else {})}
     now = {"lslam": __version__, **machine_facts()}
     other = [name for name in now if name in before and before[name] != now[name]]
-    said = [
+    sentences = [
         f"{name} was {before[name] or 'not installed'} at the run and is {now[name] or 'not installed'} now"
         for name in other
         if name != "code"
     ]
     if "code" in other and "lslam" not in other:
-        said.append(f"lslam's code is another than at the run, with the same version {__version__}")
-    return said
+        sentences.append(f"lslam's code is another than at the run, with the same version {__version__}")
+    return sentences
 
 
-def other_recording(recipe: Recipe, opened: Sequence, truth: Trajectory | None) -> list[str]:
+def other_recording(recipe: Recipe, recording: Sequence, truth: Trajectory | None) -> list[str]:
     """A sentence where the files of the recording are others than at the run, told by sizes and times before all is read."""
-    if recipe.has_moved:
+    if recipe.is_elsewhere:
         return [
             f"the recording is read from {recipe.path}, not from {recipe.manifest['sequence']['path']}: whether its files are "
             "the same is not known before the results"
         ]
     section = recipe.config.input
-    chosen = select(opened, section.start, section.count, section.skip_frames)
-    is_known = recipe.identity.get("input") in (None, input_digest(chosen, truth))
-    return [] if is_known else [f"{INPUTS['input']}, since the run in {recipe.folder}"]
+    scans = select(recording, section.start, section.count, section.skip_frames)
+    is_same = recipe.identity.get("input") in (None, input_digest(scans, truth))
+    return [] if is_same else [f"{INPUTS['input']}, since the run in {recipe.folder}"]
 
 
 def other_inputs(recipe: Recipe, identity: Mapping[str, str]) -> list[str]:
     """A sentence for each input beside the recording's files that is another; identity : of the run that was made again."""
     # Of `--osm auto` the server is no more; the recording's files are told of before.
     unknown = {"input", "osm"} if recipe.identity.get("osm") == AUTO else {"input"}
-    if recipe.has_moved:
+    if recipe.is_elsewhere:
         unknown.add("reading")  # which names the place
     return [
         text
@@ -145,25 +164,154 @@ def other_inputs(recipe: Recipe, identity: Mapping[str, str]) -> list[str]:
     ]
 
 
-def compare_results(old: Path, new: Path) -> ComparedResults:
+def compare_results(old: Path, new: Path) -> ResultComparison:
     """Compare the result files of two runs, byte by byte."""
-    found = ComparedResults()
+    result = ResultComparison()
     for name in OURS:
         files = [folder / name for folder in (old, new)]
         if name in _ALWAYS_OTHER or not any(file.exists() for file in files):
             continue
         if not all(file.exists() for file in files):
-            found.lacking.append(name)
+            result.lacking.append(name)
             continue
         first, second = (_content(file) for file in files)
-        (found.same if first == second else found.differing).append(name)
-    return found
+        (result.same if first == second else result.differing).append(name)
+    return result
 
 
 def _content(file: Path) -> bytes:
     """Bytes of a file; of evaluation.json without the place of the ground truth."""
     with input_errors(file):
-        known = file.read_bytes()
+        content = file.read_bytes()
     if file.suffix != ".json":
-        return known
-    return b"\n".join(line for line in known.split(b"\n") if not line.lstrip().startswith(b'"ground_truth":'))
+        return content
+    return b"\n".join(line for line in content.split(b"\n") if not line.lstrip().startswith(b'"ground_truth":'))
+
+
+def open_again(run: EarlierRun, sequence: Path | None = None, **reading: Any) -> Sequence:
+    """Recording of the run, with the streams that its configuration needs; `reading` overrides the run's options.
+
+    Raises InputError when it is gone.
+    """
+    return open_recording(recording_of(run, sequence), run.config, **reading_of(run, sequence, **reading))
+
+
+def reading_of(run: EarlierRun, sequence: Path | None = None, **reading: Any) -> dict[str, Any]:
+    """Options of `open_sequence` for the recording of the run, or for its new place."""
+    own = run.manifest.get("sequence", {}).get("reading", {}) if sequence is None else {}
+    return own | {name: value for name, value in reading.items() if value is not None}
+
+
+def require_another(run: Path, out: Path) -> None:
+    """Raise UsageError when both paths are one folder."""
+    if out.resolve() == run.resolve():
+        raise UsageError(f"--out {out}: the run itself stays as it is, name another folder")
+
+
+def _require_same_odometry(run: EarlierRun) -> None:
+    before = load_config(run.folder / "config.toml", environ={})
+    for section in Config.model_fields:
+        then, now = getattr(before, section), getattr(run.config, section)
+        differing = [key for key in type(then).model_fields if getattr(then, key) != getattr(now, key)]
+        if section not in FREE_SECTIONS and differing:
+            raise UsageError(
+                f"{section}.{differing[0]} is of the odometry, which is not run again: lslam graph takes "
+                f"keys of {', '.join(FREE_SECTIONS)}"
+            )
+
+
+def read_for_graph(folder: Path, settings: list[str]) -> EarlierRun:
+    """As `read_run`, for `pipeline.run` to take as `earlier`.
+
+    Raises InputError for a run that kept no odometry, or was located in a map, UsageError for settings of odometry.
+    """
+    run = read_run(folder, settings)
+    require_odometry(folder)
+    if run.config.localize.map:
+        raise InputError(f"{folder} was located in a map, which takes the place of a pose graph")
+    _require_same_odometry(run)
+    return run
+
+
+def gather_figure(
+    folder: Path,
+    what: str,
+    sequence: Path | None = None,
+    truth_of: Callable[[Sequence], Trajectory | None] = lambda sequence: None,
+    **reading: Any,
+) -> PlottedRun:
+    """Parts of the run that the figure `what` needs.
+
+    sequence : where the raw scans have moved; truth_of : gives what replaces the recording's truth, None for nothing
+    reading : as `open_sequence`
+
+    Raises InputError naming what is missing, UsageError for an unknown figure.
+    """
+    require_figure(what)
+    run = read_run(folder)
+    about: dict[str, Any] = {"georeference": run.georeference}
+    if what in ON_THE_MAP:
+        about["cloud"] = view_run(folder).cloud
+    if what == "trajectory" and (folder / "trajectory_odometry.tum").is_file():
+        about["odometry"] = read_trajectory(folder / "trajectory_odometry.tum", "tum")
+    if what == "buildings" and (folder / "buildings.geojson").is_file():
+        about["buildings"] = read_buildings_geojson(folder / "buildings.geojson")
+    if what not in ON_THE_MAP and not (what == "trajectory" and sequence is None and is_missing(run)):
+        recording = open_again(run, sequence, **reading)
+        truth = truth_of(recording) or recording.ground_truth
+        if truth is not None and what in ("trajectory", "errors"):
+            about["evaluation"] = evaluate(run.trajectory, truth, run.config.eval, calibration=recording.calibration)
+        if what == "imu":
+            about["imu"] = recording.imu
+        if what == "features":
+            odometry = create_odometry(run.config)
+            if isinstance(odometry, FeatureSource):
+                scans = choose_scans(recording, odometry, run.config)
+                about["features"] = view_features(scans, odometry, results_of(run))
+    return PlottedRun(f"{run.name} ({folder.name})", run.trajectory, **about)
+
+
+def write_figure(run: PlottedRun, what: str, path: Path, width: float, font: float) -> None:
+    """Draw a figure into `path`, .png, .svg or .pdf, atomically; width : mm; font : points.
+
+    Raises UsageError for another suffix or a size that no page has, OutputError when it cannot be written.
+    """
+    check_plot_path(path)
+    if not 20 <= width <= 2000 or not 3 <= font <= 72:
+        raise UsageError(f"--width {width:g} --font {font:g}: 20 to 2000 mm, 3 to 72 points")
+    with house_style(font):
+        image = picture(draw_figure(run, what, width), path.suffix.lstrip(".").lower(), dpi=300)
+        with atomic_write(path) as stream:
+            stream.write(image)
+
+
+def width_of(text: str) -> float:
+    """Width of a figure, mm, from `column`, `page` or a number. Raises UsageError."""
+    if text in WIDTHS:
+        return WIDTHS[text]
+    try:
+        return float(text)
+    except ValueError:
+        raise UsageError(f"--width {text}: column, page, or mm") from None
+
+
+def view_run(folder: Path) -> PlottedRun:
+    """Trajectory, odometry if there was a back end, and map, all in the run's world.
+
+    Raises InputError naming what is missing or broken; a run without a map is shown without one.
+    """
+    run = read_run(folder)
+    odometry = None
+    if (folder / "trajectory_odometry.tum").is_file():
+        odometry = read_trajectory(folder / "trajectory_odometry.tum", "tum")
+    return PlottedRun(f"{run.name} ({folder.name})", run.trajectory, odometry, cloud=_cloud(folder))
+
+
+def _cloud(folder: Path) -> ArrayCloud | None:
+    """Map of the run; LAS of a georeferenced run is transformed back to its world."""
+    try:
+        path = map_of(folder)
+    except InputError as error:
+        log.warning("%s", error)
+        return None
+    return in_own_world(path, read_cloud(path))[0]

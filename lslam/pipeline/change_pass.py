@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -24,9 +24,10 @@ from lslam.maps.clean import Cleaner, PosedScan
 from lslam.maps.georeference import to_lat_lon
 from lslam.maps.occupancy import Evidence, OccupancyMapper
 from lslam.pipeline.map_files import read_json
-from lslam.pipeline.map_pass import scan_poser, scans_again
+from lslam.pipeline.map_pass import posed_scans
 from lslam.pipeline.rebuild import EarlierRun, results_of
 from lslam.pipeline.run_folder import MANIFEST
+from lslam.pipeline.watch import SILENT, Watch
 from lslam.registration.preprocessing.ground import world_up_of
 
 log = logging.getLogger("lslam")
@@ -62,9 +63,9 @@ def frame_between(new: EarlierRun, old: EarlierRun) -> Floats:
 
 def _frame_of(run: EarlierRun) -> Path:
     """Run folder, or map file of another program, whose coordinate frame the run uses."""
-    here, manifest, seen = run.folder.resolve(), run.manifest, set[Path]()
-    while here not in seen:
-        seen.add(here)
+    here, manifest, passed = run.folder.resolve(), run.manifest, set[Path]()
+    while here not in passed:
+        passed.add(here)
         about = manifest.get("localization")
         if not isinstance(about, dict) or not about.get("map"):
             break
@@ -81,14 +82,12 @@ def compare_runs(
     T_old_new: Floats,
     *,
     spool: Path | None = None,
-    on_step: Callable[[], None] = lambda: None,
-    should_stop: Callable[[], bool] = lambda: False,
+    watch: Watch = SILENT,
 ) -> ChangedCells:
     """Changes between both runs, in the world of the old one.
 
     Moving objects are removed from each drive separately. Cells and their range are those of the new run's configuration.
-    Data too large for memory are kept in a temporary folder in `spool`. Raises InterruptedRunError when `should_stop` says
-    so.
+    Data too large for memory are kept in a temporary folder in `spool`. Raises InterruptedRunError when `watch` says so.
     """
     section = new[0].config.map
     origin = np.floor(old[0].trajectory.positions[0] / section.occupancy_voxel).astype(np.int64)
@@ -102,15 +101,13 @@ def compare_runs(
             for scan in scans:
                 mapper.add(scan.points, T @ scan.T_world_lidar)
 
-        results = results_of(run)
-        poser, numbers = scan_poser(results, run.config), range(len(results))
-        for _, loaded in scans_again(sequence, poser, numbers, run.config, on_step, should_stop, INTERRUPTED):
-            if loaded.prepared is not None:
-                enter(cleaner.add(loaded.prepared))
+        for _, scan in posed_scans(sequence, results_of(run), run.config, watch, INTERRUPTED):
+            if scan is not None:
+                enter(cleaner.add(scan))
         enter(cleaner.finish())
         return mapper.evidence()
 
-    with asking(should_stop, INTERRUPTED):
+    with asking(watch.should_stop, INTERRUPTED):
         before = cast(*old, np.eye(4))
         return changed_cells(cast(*new, T_old_new), before)
 
@@ -140,29 +137,29 @@ def output_folder(folder: Path, overwrite: bool) -> Iterator[None]:
         raise
 
 
-def write_changes(folder: Path, found: ChangedCells, new: EarlierRun, old: EarlierRun) -> None:
+def write_changes(folder: Path, result: ChangedCells, new: EarlierRun, old: EarlierRun) -> None:
     """Write changes.ply, changed and unchanged cells, and changes.geojson, an outline of each object.
 
     The cloud, m, is in the world of the old run; outlines are in longitude and latitude when it is georeferenced, else in
     metres of that world, which the file says. Raises OutputError.
     """
-    kinds = [np.full(len(c.cells), 1 if c.kind == "appeared" else -1) for c in found.changes]
-    change = np.concatenate([*kinds, np.zeros(len(found.same), np.int64)])
-    thing = np.repeat(np.arange(len(kinds) + 1), [*(len(k) for k in kinds), len(found.same)])
-    cells = np.concatenate([*(c.cells for c in found.changes), found.same])
+    kinds = [np.full(len(c.cells), 1 if c.kind == "appeared" else -1) for c in result.changes]
+    change = np.concatenate([*kinds, np.zeros(len(result.same), np.int64)])
+    thing = np.repeat(np.arange(len(kinds) + 1), [*(len(k) for k in kinds), len(result.same)])
+    cells = np.concatenate([*(c.cells for c in result.changes), result.same])
     write_ply(
         folder / CLOUD,
-        (cells + 0.5) * found.voxel,
+        (cells + 0.5) * result.voxel,
         colours=_COLOURS[change + 1],
         scalars={"change": change, "thing": np.where(change == 0, 0, thing + 1)},
-        comment=f"lslam {__version__} changes from {old.folder} to {new.folder}, cells of {found.voxel:g} m; {old.world}",
+        comment=f"lslam {__version__} changes from {old.folder} to {new.folder}, cells of {result.voxel:g} m; {old.world}",
     )
     place = old.georeference
-    about = {"old": str(old.folder), "new": str(new.folder), "voxel_m": found.voxel, "lslam": __version__}
+    about = {"old": str(old.folder), "new": str(new.folder), "voxel_m": result.voxel, "lslam": __version__}
     if place is None:
         about["frame"] = f"m in the world of {old.folder}: {old.world}"
-    areas = [_outline(change, place) for change in found.changes]
-    write_areas(folder / AREAS, areas, [properties(k, c) for k, c in enumerate(found.changes, 1)], about)
+    areas = [_outline(change, place) for change in result.changes]
+    write_areas(folder / AREAS, areas, [properties(k, c) for k, c in enumerate(result.changes, 1)], about)
 
 
 def _outline(change: MapChange, place: Georeference | None) -> Floats:
@@ -186,5 +183,5 @@ def properties(number: int, change: MapChange) -> dict[str, str | int | float]:
         "width_m": width,
         "volume_m3": change.volume,
     }
-    rounded = {name: round(float(value), 3) for name, value in measures.items()}
-    return {"thing": number, "kind": change.kind, "cells": len(change.cells), **rounded}
+    values = {name: round(float(value), 3) for name, value in measures.items()}
+    return {"thing": number, "kind": change.kind, "cells": len(change.cells), **values}

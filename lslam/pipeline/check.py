@@ -1,6 +1,9 @@
-"""Checks of a configuration across its sections, without heavy imports."""
+"""A configuration across its sections, without heavy imports: its checks, and a recording opened as it asks."""
 
 from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from lslam.backend.loops import require_descriptor
 from lslam.core.config import Config
@@ -8,14 +11,18 @@ from lslam.core.config.config import read_preset
 from lslam.core.config.odometry import FIXED_DEVICE, TIGHTLY_COUPLED
 from lslam.core.errors import UsageError
 from lslam.evaluation import check_words, parse_delta
+from lslam.io.readers import open_sequence
 from lslam.odometry import FEATURE_METHODS, METHODS, require_method
 from lslam.osm import find_matcher
 from lslam.registration.residuals import find_residual
 
+if TYPE_CHECKING:
+    from lslam.core.types.sequence import Sequence
+
 # Methods that match a scan against Gaussian voxels, and what only some methods look at. A policy of `recovery` that is switched
 # off is heeded by all: those that override it have it switched off.
 ON_GAUSSIANS = tuple(name for name, (module, _) in METHODS.items() if module == METHODS["icp"][0])
-HEEDED = {
+ONLY_OF = {
     "registration.residual": ON_GAUSSIANS,
     "registration.target": ON_GAUSSIANS,
     "registration.keyframes": ON_GAUSSIANS,
@@ -56,7 +63,7 @@ def check_config(config: Config) -> None:
         require_open3d()
     if config.registration.residual is not None:
         find_residual(config.registration.residual)
-    _check_heeded(config)
+    _check_effect(config)
     find_matcher(config.osm.matcher)
     if not config.osm.extract and (config.osm.origin is not None or config.osm.heading_deg is not None):
         raise UsageError("--origin and --heading do nothing without --osm FILE: give it, or drop them")
@@ -68,10 +75,10 @@ def check_config(config: Config) -> None:
 
 def _check_places(config: Config) -> None:
     """Raise UsageError for keys of a place on the Earth that have no effect or contradict each other."""
-    wanted = "--crs" if config.gnss.crs or config.gnss.height_crs else "--geoid" if config.gnss.geoid else ""
-    if wanted and config.gnss.mode == "off" and not (config.osm.extract or config.graph.control):
+    flag = "--crs" if config.gnss.crs or config.gnss.height_crs else "--geoid" if config.gnss.geoid else ""
+    if flag and config.gnss.mode == "off" and not (config.osm.extract or config.graph.control):
         raise UsageError(
-            f"{wanted} does nothing without --gnss, --georeference, --osm or --control, which tell where on the Earth the run "
+            f"{flag} does nothing without --gnss, --georeference, --osm or --control, which tell where on the Earth the run "
             "lies: give one of them, or drop it"
         )
     if config.localize.map and config.osm.extract:
@@ -110,12 +117,12 @@ def _check_imu(config: Config) -> None:
         )
 
 
-def _check_heeded(config: Config) -> None:
+def _check_effect(config: Config) -> None:
     """Raise UsageError for a changed key that the method would silently ignore."""
     method = config.odometry.method
     if method not in METHODS:
         return  # of another package: it knows what it takes
-    for name, methods in HEEDED.items():
+    for name, methods in ONLY_OF.items():
         part, _, key = name.partition(".")
         section = getattr(config, part)
         value, default = getattr(section, key), type(section).model_fields[key].default
@@ -131,3 +138,14 @@ def _check_heeded(config: Config) -> None:
                 f"{name} = {value!r} does nothing with method {method}: drop it, or use one that heeds it "
                 f"({', '.join(methods)})"
             )
+
+
+def open_recording(place: str | Path, config: Config, **reading: Any) -> Sequence:
+    """Open a recording with the streams that the configuration needs; reading : further options of `open_sequence`."""
+    return open_sequence(
+        place,
+        vertical_correction_deg=config.input.vertical_correction_deg,
+        imu=config.imu.use,
+        gnss=config.gnss.mode != "off",
+        **reading,
+    )

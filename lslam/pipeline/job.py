@@ -37,11 +37,11 @@ from lslam.odometry.frontend.wheel_start import Wheels, begin_wheels
 from lslam.odometry.given import GivenMotion, GivenPoses
 from lslam.osm.source import OsmSource, open_osm
 from lslam.pipeline.check import check_config
-from lslam.pipeline.doctor.examine_positions import examine_jumps
-from lslam.pipeline.doctor.examine_units import examine_units
+from lslam.pipeline.doctor import Findings
+from lslam.pipeline.doctor.examine_positions import examine_jumps, examine_units
 from lslam.pipeline.manifest import Manifest, describe_deskew
-from lslam.pipeline.map_attributes import KEY, needs_labels, with_attributes
-from lslam.pipeline.prior_map_files import require_map
+from lslam.pipeline.map_pass import KEY, needs_labels, with_attributes
+from lslam.pipeline.map_tiles import require_map
 from lslam.pipeline.run_folder import RunFolder
 from lslam.pipeline.watch import Watch
 from lslam.registration.preprocessing.views import WithoutClasses, with_rings
@@ -54,7 +54,7 @@ OPEN_KEYS = (*(f"{section}.{key}" for section, keys in LENGTHS.items() for key i
 
 @dataclass(frozen=True)
 class PreparedRun:
-    """What is to be done, resolved: the chosen scans, the method, the truth and the map; `given` are the poses of --poses.
+    """What is to be done, resolved: the scans that are used, the method, the truth and the map; `poses` are those of --poses.
 
     store : the keyframes; folder, checkpoints : None for a run that stays in memory
     """
@@ -63,7 +63,7 @@ class PreparedRun:
     odometry: Odometry
     config: Config
     truth: Trajectory | None
-    given: Trajectory | None
+    poses: Trajectory | None
     manifest: Manifest
     watch: Watch
     osm: OsmSource | None
@@ -73,7 +73,7 @@ class PreparedRun:
     checkpoints: OdometryCheckpoints | None = None
     wheels: Wheels = field(default_factory=Wheels)
 
-    def kept(self, stage: str) -> Checkpoints | None:
+    def checkpoints_of(self, stage: str) -> Checkpoints | None:
         """Checkpoints of a later stage beside those of odometry."""
         every_s = self.config.odometry.checkpoint_s
         return None if self.checkpoints is None else Checkpoints(self.checkpoints.folder, stage, every_s)
@@ -96,19 +96,19 @@ def prepare(
         # Before the odometry and not after it.
         sequence.calibration.T_lidar(config.eval.frame)
     odometry = create_odometry(with_imu_settings(config))
-    given: Trajectory | None = None
+    poses: Trajectory | None = None
     if isinstance(odometry, GivenPoses):
         sequence.notes.extend(bind(odometry, sequence))
-        given = odometry.trajectory
+        poses = odometry.trajectory
     if config.localize.map:
         require_map(Path(config.localize.map), config.gnss.mode != "off")
-    chosen = choose_scans(sequence, odometry, config)
+    scans = choose_scans(sequence, odometry, config)
     if config.map.write:
-        with_attributes(chosen, config)  # before the odometry and not after it
+        with_attributes(scans, config)  # before the odometry and not after it
     osm = open_osm(sequence, config)
-    manual = read_manual(config, chosen)
-    manifest, store = Manifest(command, chosen, config), KeyframeStore(deflate=config.keyframes.deflate)
-    return PreparedRun(chosen, odometry, config, truth, given, manifest, watch, osm, manual, store, wheels=wheels)
+    manual = read_manual(config, scans)
+    manifest, store = Manifest(command, scans, config), KeyframeStore(deflate=config.keyframes.deflate)
+    return PreparedRun(scans, odometry, config, truth, poses, manifest, watch, osm, manual, store, wheels=wheels)
 
 
 def is_open(config: Config, key: str) -> bool:
@@ -129,8 +129,8 @@ def fit_to_scene(job: PreparedRun, earlier: Config | None = None) -> PreparedRun
     if config == job.config:
         return job
     job.manifest.config = config
-    is_given = isinstance(job.odometry, GivenPoses)
-    odometry = job.odometry if is_given else create_odometry(with_imu_settings(config))
+    has_poses = isinstance(job.odometry, GivenPoses)
+    odometry = job.odometry if has_poses else create_odometry(with_imu_settings(config))
     return replace(job, config=config, odometry=odometry)
 
 
@@ -151,19 +151,19 @@ def choose_scans(sequence: Sequence, odometry: Odometry, config: Config) -> Sequ
     Raises UsageError when nothing is left, InputError naming --rings when there are no rings to be found, when stated
     times do not fit, and when labels are needed and there are none.
     """
-    dropped = config.preprocess.drop_labels
+    labels = config.preprocess.drop_labels
     needs = {
-        "preprocess.drop_labels": dropped,
+        "preprocess.drop_labels": labels,
         "osm.labels": config.osm.extract and config.osm.needs_labels,
         KEY: config.map.write and needs_labels(config.map),
     }
     if any(needs.values()):
-        sequence = with_labels(sequence, next(key for key, is_needed in needs.items() if is_needed))
+        sequence = with_labels(sequence, next(key for key, needed in needs.items() if needed))
     sequence = with_point_times(sequence, config.preprocess)
     if odometry.needs_rings:
         sequence = with_rings(sequence, config.input.rings)
     # Rules for times and rings know where in its scan a point stands.
-    sequence = WithoutClasses(sequence, dropped) if dropped else sequence
+    sequence = WithoutClasses(sequence, labels) if labels else sequence
     return select(sequence, config.input.start, config.input.count, config.input.skip_frames)
 
 
@@ -174,22 +174,19 @@ def announce(job: PreparedRun) -> None:
     for note in sequence.notes:
         log.info("%s", note)
     sweep = sweep_of(sequence)
-    units = examine_units(
-        getattr(sequence, "whole", sequence),
-        job.truth,
-        config.imu.use,
-        config.gnss.mode != "off",
-        None if sequence.motion_compensated else sweep,
-    )
-    job.manifest.problems += map(str, [*units, *examine_jumps(job.truth)])
+    findings, whole = Findings(), getattr(sequence, "whole", sequence)
+    span = None if sequence.motion_compensated else sweep
+    examine_units(whole, findings, job.truth, config.imu.use, config.gnss.mode != "off", span)
+    examine_jumps(job.truth, findings)
+    job.manifest.problems += map(str, findings)
     for problem in [*sequence.problems, *job.manifest.problems]:
         log.warning("%s", problem)
-    deskew, is_distorted = describe_deskew(sequence, config, sweep is not None, job.odometry.deskew)
+    deskew, distorts = describe_deskew(sequence, config, sweep is not None, job.odometry.deskew)
     job.manifest.deskew = deskew
     job.manifest.pose_time = (sweep or Span()).instant
-    if not config.imu.use and (unused := _set_by_hand(config)):
-        log.warning("%s: without effect, this run has no IMU; --imu gives it one", ", ".join(unused))
-    if is_distorted:
+    if not config.imu.use and (keys := _set_by_hand(config)):
+        log.warning("%s: without effect, this run has no IMU; --imu gives it one", ", ".join(keys))
+    if distorts:
         log.warning("%s", deskew)
     else:
         log.info("deskew: %s", deskew)
@@ -204,10 +201,10 @@ def _set_by_hand(config: Config) -> list[str]:
 
 
 @contextmanager
-def stoppable(job: PreparedRun, said: str) -> Iterator[None]:
-    """What is asked to stop in the block ends it, and the run is interrupted with the sentence `said`."""
+def stoppable(job: PreparedRun, message: str) -> Iterator[None]:
+    """What is asked to stop in the block ends it, and the run is interrupted with the `message`."""
     try:
-        with asking(job.watch.should_stop, said):
+        with asking(job.watch.should_stop, message):
             yield
     except InterruptedRunError as error:
         job.manifest.interrupt(str(error))
@@ -228,8 +225,8 @@ def bind(odometry: GivenPoses, sequence: Sequence) -> list[str]:
             )
         trajectory = replace(trajectory, stamps_ns=np.asarray(sequence.stamps_ns, np.int64), has_stamps=True)
         notes.append("poses without stamps: line i is scan i")
-    trajectory, said = _of_lidar(trajectory, sequence)
-    notes += said
+    trajectory, note = _of_lidar(trajectory, sequence)
+    notes += [note] if note else []
     (first, last), (begin, end) = ((1e-9 * s[0], 1e-9 * s[-1]) for s in (trajectory.stamps_ns, sequence.stamps_ns))
     if first > end or last < begin:
         raise InputError(
@@ -242,21 +239,21 @@ def bind(odometry: GivenPoses, sequence: Sequence) -> list[str]:
     return notes
 
 
-def _of_lidar(trajectory: Trajectory, sequence: Sequence) -> tuple[Trajectory, list[str]]:
-    """The trajectory of the LiDAR; a file's word for its body counts unless the motion says otherwise."""
+def _of_lidar(trajectory: Trajectory, sequence: Sequence) -> tuple[Trajectory, str]:
+    """The trajectory of the LiDAR, and a note. A file's word for its body counts unless the motion says otherwise."""
     axis = main_axis(trajectory.poses)
     is_camera = trajectory.frame == "cam0" and axis not in ("+x", "-x")
     T = sequence.calibration.T_cam0_lidar
     if is_camera and T is not None:
-        moved = se3.inverse(T) @ trajectory.poses @ T
-        return replace(trajectory, poses=moved, frame="lidar"), [
-            "poses of camera 0 converted to the LiDAR with T_cam0_lidar"
-        ]
+        poses = se3.inverse(T) @ trajectory.poses @ T
+        return replace(
+            trajectory, poses=poses, frame="lidar"
+        ), "poses of camera 0 converted to the LiDAR with T_cam0_lidar"
     if trajectory.frame == "imu" and (T_lidar_imu := sequence.calibration.T_lidar_imu) is not None:
-        moved = trajectory.poses @ se3.inverse(T_lidar_imu)
-        return replace(trajectory, poses=moved, frame="lidar"), [
-            "poses of the IMU converted to the LiDAR with T_lidar_imu"
-        ]
+        poses = trajectory.poses @ se3.inverse(T_lidar_imu)
+        return replace(
+            trajectory, poses=poses, frame="lidar"
+        ), "poses of the IMU converted to the LiDAR with T_lidar_imu"
     if axis in ("+z", "-z") or is_camera or trajectory.frame == "imu":
         body = {"cam0": "the camera", "imu": "the IMU"}.get(
             trajectory.frame, "a camera (they advance along its z axis)"
@@ -265,4 +262,4 @@ def _of_lidar(trajectory: Trajectory, sequence: Sequence) -> tuple[Trajectory, l
             f"{trajectory.source} has poses of {body}, and {sequence.name} does not say where that sits on the LiDAR: convert "
             "them with `lslam convert --frame lidar`, or give the calibration (calib.txt, --extrinsics)"
         )
-    return trajectory, []
+    return trajectory, ""

@@ -1,4 +1,4 @@
-"""Second pass in an existing map: the start of the drive, then every scan on the map, with odometry as the prior."""
+"""Second pass in an existing map: the start of the drive, every scan on the map, with odometry as the prior, and what differs."""
 
 from __future__ import annotations
 
@@ -20,7 +20,9 @@ from lslam.core.config import Config
 from lslam.core.errors import InterruptedRunError, RunFailedError
 from lslam.core.geometry import noise, se3
 from lslam.core.geometry.geodesy import to_local
-from lslam.core.types.arrays import Floats
+from lslam.core.stopping import asking
+from lslam.core.types.arrays import Bools, Floats
+from lslam.core.types.cloud import ArrayCloud, thin_out
 from lslam.core.types.constraint import MapFix
 from lslam.core.types.run_record import RunRecord
 from lslam.core.types.scan import Scan
@@ -28,22 +30,29 @@ from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.sequence import Sequence
 from lslam.core.types.trajectory import Keyframe
 from lslam.io.formats.state_files import Records
+from lslam.maps.changes import MapChange, differences, points_in
+from lslam.maps.floor_plan import pixel_size, top_view
+from lslam.maps.occupancy import Evidence, OccupancyMapper
 from lslam.odometry.frontend.register_scans import read_ahead, to_trajectory
-from lslam.odometry.inertial.constant_velocity import Course
 from lslam.pipeline.job import PreparedRun
 from lslam.pipeline.manifest import Manifest
-from lslam.pipeline.map_pass import motion_within
-from lslam.pipeline.prior_map_files import read_prior_map
-from lslam.pipeline.prior_map_view import view_prior_map
+from lslam.pipeline.map_pass import SAMPLE, begin_pass, course_of, map_checkpoints, motion_within, posed_scans
+from lslam.pipeline.map_tiles import read_prior_map
 from lslam.pipeline.watch import Watch
 from lslam.registration.preprocessing.deskew import deskew
 from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_points
 
 log = logging.getLogger("lslam")
 # Sentences of reasons in a message, at most.
-MOST_SAID = 3
+MOST_REASONS = 3
 # m that the antenna may be away from the LiDAR.
 ANTENNA_M = 3.0
+WORDS = {"changed": "where it has changed", "beyond": "beyond its end", "unread": "without points"}
+MOST_DIFFERING = SAMPLE // 4  # points of what is gone, and of what is not in the map
+# Scans nearer to each other see the same; so many of them make cells certain.
+SPACING_M, LEAST_SCANS = 1.0, 100
+COMPARISON = "comparison with the map"
+INTERRUPTED = "interrupted while the drive was compared with the map"
 
 
 def localise_poses(job: PreparedRun, record: RunRecord) -> None:
@@ -55,11 +64,11 @@ def localise_poses(job: PreparedRun, record: RunRecord) -> None:
     config, manifest = job.config, job.manifest
     if manifest.outcome in ("interrupted", "diverged"):
         return
-    with manifest.timed("localise_s"):
+    with manifest.time("localise_s"):
         prior_map = read_prior_map(Path(config.localize.map), config.registration)
         try:
             search = PlaceFinder(PlaceSearch(prior_map, config.registration), job.store, config)
-            fixes, start = _followed(job, record.results, prior_map, search)
+            fixes, start = _follow(job, record.results, prior_map, search)
         except InterruptedRunError as error:
             manifest.interrupt(str(error))
             return
@@ -67,26 +76,26 @@ def localise_poses(job: PreparedRun, record: RunRecord) -> None:
     _tell(record, prior_map, start, config, manifest)
     if job.folder is None or not config.report.html:
         return
-    with manifest.timed("differences_s"):
+    with manifest.time("differences_s"):
         try:
             view_prior_map(job, record, prior_map)
         except InterruptedRunError as error:
             manifest.interrupt(str(error))
 
 
-def _followed(
+def _follow(
     job: PreparedRun, results: list[ScanResult], prior_map: PriorMap, search: PlaceFinder
 ) -> tuple[list[MapFix], dict[str, Any]]:
     """Register every scan on the map, from a start that is searched first; poses are still in level axes."""
-    sequence, config, watch, checkpoints = job.sequence, job.config, job.watch, job.kept("localise")
-    known = None if checkpoints is None else checkpoints.latest()
+    sequence, config, watch, checkpoints = job.sequence, job.config, job.watch, job.checkpoints_of("localise")
+    earlier = None if checkpoints is None else checkpoints.latest()
     poses = np.stack([r.T_world_lidar for r in results])
     of_map = hashlib.sha256(prior_map.points.tobytes()).hexdigest()
-    if known is not None and not (np.array_equal(known["poses"], poses) and known["map"] == of_map):
-        known = None
+    if earlier is not None and not (np.array_equal(earlier["poses"], poses) and earlier["map"] == of_map):
+        earlier = None
     view = LocalView(prior_map, config.registration, 1.2 * config.preprocess.range_max)
     reanchor = Reanchoring(search, results)
-    if known is None:
+    if earlier is None:
         watch.on_start("search", 0)
         start = _find_start(sequence, prior_map, search, config, watch)
         follower = MapFollower(view, *_at_first_scan(start, search.store, results, config), config, reanchor)
@@ -99,11 +108,11 @@ def _followed(
         }
     else:
         follower = MapFollower(view, np.eye(4), np.eye(6), config, reanchor)
-        follower.restore(known["follower"])
-        fixes, about = known["fixes"], known["start"]
+        follower.restore(earlier["follower"])
+        fixes, about = earlier["fixes"], earlier["start"]
         log.info("localisation: going on after %d scans", len(fixes))
     watch.on_start("localise", len(results) - len(fixes))
-    course = Course(np.array([r.stamp_ns for r in results], np.int64), poses)
+    course = course_of(results)
 
     def prepare(scan: Scan) -> PreparedPoints:
         times = scan.times if config.preprocess.deskew else None
@@ -156,16 +165,16 @@ class Reanchoring:
 
 def _find_start(sequence: Sequence, prior_map: PriorMap, search: PlaceFinder, config: Config, watch: Watch) -> Start:
     """Find the start of the drive in the map. Raises RunFailedError when there is none, InterruptedRunError on a stop."""
-    prior, said = _prior_of(sequence, prior_map, config)
-    log.info("searching the drive in the map, %s", said)
+    prior, where = _prior_of(sequence, prior_map, config)
+    log.info("searching the drive in the map, %s", where)
     start = search.find(prior, watch.should_stop)
     if watch.should_stop():
         raise InterruptedRunError("interrupted before the drive was found in the map")
     if start is None:
-        counted = Counter(reason.split(",")[0] for reason in search.reasons).most_common(MOST_SAID)
-        why = "; ".join(f"{reason} ({count} x)" for reason, count in counted) or "keyframes do not agree"
+        counts = Counter(reason.split(",")[0] for reason in search.reasons).most_common(MOST_REASONS)
+        why = "; ".join(f"{reason} ({count} x)" for reason, count in counts) or "keyframes do not agree"
         raise RunFailedError(
-            f"the drive was not found in {prior_map.source}, {said}: {why}. Say where it begins with --start X,Y,HEADING"
+            f"the drive was not found in {prior_map.source}, {where}: {why}. Say where it begins with --start X,Y,HEADING"
         )
     log.info(
         "found in the map by %d of %d keyframes tried, %.0f %% of the upright points fit",
@@ -205,14 +214,14 @@ def _at_first_scan(
     keyframe = store.keyframes[start.vote.keyframe]
     T = start.vote.T_level_odometry @ results[0].T_world_lidar
     at = start.vote.T_level_odometry @ keyframe.T_world_lidar
-    carried = noise.transport(start.vote.covariance, T[:3, 3] - at[:3, 3])
+    C = noise.transport(start.vote.covariance, T[:3, 3] - at[:3, 3])
     c, way = config.loops, keyframe.distance
     systematic = np.diag(
         np.repeat(
             [(0.01 * c.drift_percent * way + c.sigma_m) ** 2, np.deg2rad(c.drift_deg * way / 100 + c.sigma_deg) ** 2], 3
         )
     )
-    return T, np.asarray(carried + drift_covariance(way, config.graph) + systematic)
+    return T, np.asarray(C + drift_covariance(way, config.graph) + systematic)
 
 
 def _deliver(record: RunRecord, prior_map: PriorMap, fixes: list[MapFix], config: Config) -> None:
@@ -223,14 +232,14 @@ def _deliver(record: RunRecord, prior_map: PriorMap, fixes: list[MapFix], config
         replace(f, T_map_lidar=T @ f.T_map_lidar, covariance=noise.rotate(f.covariance, T[:3, :3]))
         for f in mark_doubts(fixes)
     ]
-    held = [k for k, fix in enumerate(into_map) if fix.is_binding]
-    if not held:
+    numbers = [k for k, fix in enumerate(into_map) if fix.is_binding]
+    if not numbers:
         raise RunFailedError(f"no scan agrees with {prior_map.source} where the drive was found: {fixes[0].reason}")
-    first = held[0]
+    first = numbers[0]
     record.T_final_odometry = into_map[first].T_map_lidar @ se3.inverse(results[first].T_world_lidar)
-    anchors = [Keyframe(n, k, results[k].stamp_ns, results[k].T_world_lidar) for n, k in enumerate(held)]
-    poses = np.stack([into_map[k].T_map_lidar for k in held])
-    covariances = np.stack([into_map[k].covariance for k in held])
+    anchors = [Keyframe(n, k, results[k].stamp_ns, results[k].T_world_lidar) for n, k in enumerate(numbers)]
+    poses = np.stack([into_map[k].T_map_lidar for k in numbers])
+    covariances = np.stack([into_map[k].covariance for k in numbers])
     record.odometry = record.trajectory
     record.results = correct_scans(results, anchors, poses, covariances, 1.0, config.graph)
     record.trajectory = to_trajectory(record.results, record.method)
@@ -256,7 +265,7 @@ def _tell(record: RunRecord, prior_map: PriorMap, start: dict[str, Any], config:
         "doubted": doubtful,
         "inlier_share": round(float(np.median(shares)), 4),
     }
-    others = ", ".join(f"{counts[status]} {said}" for status, said in WORDS.items() if counts[status])
+    others = ", ".join(f"{counts[status]} {where}" for status, where in WORDS.items() if counts[status])
     if others:
         manifest.problems.append(
             f"the map does not hold {len(fixes) - counts['held']} of {len(fixes)} scans ({others}): odometry carries them"
@@ -268,4 +277,72 @@ def _tell(record: RunRecord, prior_map: PriorMap, start: dict[str, Any], config:
         )
 
 
-WORDS = {"changed": "where it has changed", "beyond": "beyond its end", "unread": "without points"}
+def view_prior_map(job: PreparedRun, record: RunRecord, prior_map: PriorMap) -> None:
+    """Put the map near the drive into the record, with the column `change`: -1 gone, 0 as it was, 1 not in the map.
+
+    Only scans that the map holds tell what differs, about one a metre. Raises InterruptedRunError when the run is to stop.
+    """
+    section, results = job.config.map, record.results
+    positions = se3.apply(se3.inverse(prior_map.T_map_level), record.trajectory.positions)
+    near = se3.apply(prior_map.T_map_level, prior_map.along(positions, section.occupancy_range).astype(np.float64))
+    apart = spread_out(record.trajectory.path_lengths)
+    some = [
+        r if fix.is_binding and is_far else replace(r, status="bridged")
+        for r, fix, is_far in zip(results, record.map_fixes, apart, strict=True)
+    ]
+    evidence = _observe(job, some)
+    changes = differences(evidence, near)
+    kinds = {kind: [change for change in changes if change.kind == kind] for kind in ("appeared", "vanished")}
+    is_absent = points_in(near, kinds["vanished"], evidence)
+    new = np.concatenate([np.zeros((0, 3)), *(_fill(change) for change in kinds["appeared"])])
+    differing = [thin_out(ArrayCloud(part), MOST_DIFFERING).points for part in (near[is_absent], new)]
+    same = thin_out(ArrayCloud(near[~is_absent]), SAMPLE - sum(map(len, differing))).points
+    parts = [same, *differing]
+    change = np.repeat([0, -1, 1], [len(part) for part in parts])
+    record.map_sample = ArrayCloud(np.concatenate(parts), columns={"change": change.astype(np.int8)})
+    view = top_view(ArrayCloud(near), pixel_size(section.voxel))
+    record.map_image, record.map_heights, record.map_extent = view.image, view.heights, view.extent
+    job.manifest.localization["differences"] = {
+        "voxel_m": evidence.voxel,
+        "gone": len(kinds["vanished"]),
+        "not_in_the_map": len(kinds["appeared"]),
+    }
+    log.info("against the map: %d things gone, %d not in it", len(kinds["vanished"]), len(kinds["appeared"]))
+
+
+def spread_out(way: Floats) -> Bools:
+    """Scans that tell what differs, by the way (N,) travelled, m: the first of each metre, or more of a drive of few metres."""
+    spacing = max(min(SPACING_M, float(way[-1]) / LEAST_SCANS), 1e-9)
+    return np.asarray(np.diff(np.floor(way / spacing), prepend=-1.0) > 0)
+
+
+def _observe(job: PreparedRun, results: list[ScanResult]) -> Evidence:
+    """Cells that the registered scans of the drive hit or pass; a stopped run goes on from its checkpoint."""
+    section, watch, poses = job.config.map, job.watch, np.stack([r.T_world_lidar for r in results])
+    assert job.folder is not None
+    folder = job.folder
+
+    def make(keep: Path | None) -> OccupancyMapper:
+        return OccupancyMapper(
+            section.occupancy_voxel,
+            section.range_min,
+            section.occupancy_range,
+            spool=folder.path,
+            keep=None if keep is None else keep / "differences",
+            origin=np.floor(poses[0, :3, 3] / section.occupancy_voxel).astype(np.int64),
+        )
+
+    mapper, count, offer = begin_pass(map_checkpoints(folder, job.config, COMPARISON), make, poses)
+    watch.on_start("differences", len(results))
+    numbers = range(count, len(results))
+    for _, scan in posed_scans(job.sequence, results, job.config, watch, INTERRUPTED, numbers, count, offer):
+        if scan is not None:
+            mapper.add(scan.points, scan.T_world_lidar)
+    with asking(watch.should_stop, INTERRUPTED):
+        return mapper.evidence()
+
+
+def _fill(change: MapChange) -> Floats:
+    """(8 K, 3) m, points in the cells of a change, as dense as those of a map with voxels of half a cell."""
+    corners = np.stack(np.meshgrid(*[(-0.25, 0.25)] * 3), axis=-1).reshape(-1, 3) * change.voxel
+    return np.asarray((change.centres[:, None] + corners).reshape(-1, 3))

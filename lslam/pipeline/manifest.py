@@ -5,15 +5,16 @@ from __future__ import annotations
 import hashlib
 import platform
 import sys
-import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from copy import copy
 from dataclasses import asdict
 from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
 from lslam.core import __version__
@@ -50,7 +51,7 @@ class Manifest:
     graph, georeference : what the back end did and where on the Earth the world lies, empty where it did nothing
     refinement : how much thinner planes became by it, empty where none was asked for
     localization : how the drive was found in a map that exists and how many scans that holds, empty without one
-    identity : digests that a run and its resumption share; resumed_after : scans that were done when it was resumed
+    identity : digests that a run and its resumption share; resumed_after_scans : that were done when it was resumed
     posed_by : scans by who posed them: the method, what stood in for it, the motion prior
     segments : of a run that lost its map on the way, each with its connection to the others
     integrity : how many pairs of scans checked the motion beside the method, how many were conclusive, and the alerts raised
@@ -84,7 +85,7 @@ class Manifest:
         self.georeference: dict[str, Any] = {}
         self.localization: dict[str, Any] = {}
         self.identity: dict[str, str] = {}
-        self.resumed_after: list[int] = []
+        self.resumed_after_scans: list[int] = []
         self.last: dict[str, Any] = {}
         self._ended = ""
 
@@ -94,16 +95,16 @@ class Manifest:
         return self._ended or ("degraded" if self.problems or self.sequence.problems else "done")
 
     @contextmanager
-    def timed(self, name: str) -> Iterator[None]:
+    def time(self, name: str) -> Iterator[None]:
         """Context that adds the duration of its block, s, to the timings."""
-        began = time.perf_counter()
+        began = perf_counter()
         try:
             yield
         finally:
-            self.timings[name] = self.timings.get(name, 0.0) + time.perf_counter() - began
+            self.timings[name] = self.timings.get(name, 0.0) + perf_counter() - began
 
-    def judge(self, results: list[ScanResult], expected: int, diverged: bool) -> None:
-        """Count the results of the scans and derive the outcome of the run."""
+    def judge(self, results: list[ScanResult], scans: int, diverges: bool) -> None:
+        """Count the results of the `scans` and derive the outcome of the run; diverges : whether its odometry did."""
         self.counts = {"scans": len(results)} | {
             status: sum(r.status == status for r in results) for status in ("ok", "bridged", "skipped")
         }
@@ -118,10 +119,10 @@ class Manifest:
                 f"{len(bad)} of {len(results)} scans were not registered and follow the motion prior, "
                 f"the first is scan {bad[0].index}: {bad[0].reason}"
             )
-        if diverged:
+        if diverges:
             self._ended = "diverged"
-        elif len(results) < expected:
-            self.interrupt(f"interrupted after {len(results)} of {expected} scans")
+        elif len(results) < scans:
+            self.interrupt(f"interrupted after {len(results)} of {scans} scans")
 
     def _judge_degenerate(self, results: list[ScanResult]) -> None:
         """Add a problem if many scans leave a direction unobservable: there the motion prior drifts."""
@@ -166,7 +167,7 @@ class Manifest:
             "command": self.command,
             "lslam": __version__,
             **({"ground_truth": self.truth_file} if self.truth_file else {}),
-            **({"identity": dict(self.identity)} if self.identity else {}),
+            **self._sections("identity"),
             "method": self.config.odometry.method,
             "sequence": {
                 "name": s.name,
@@ -189,18 +190,12 @@ class Manifest:
                 "covariances.npz": "covariances: of the poses in the world; registration: against the local map (NaN: none); "
                 "both (N, 6, 6) of t' = t + d[:3], R' = exp(d[3:]) R in world axes, m2 and rad2",
             },
-            **({"imu": dict(self.imu)} if self.imu else {}),
-            **({"wheels": dict(self.wheels)} if self.wheels else {}),
+            **self._sections("imu", "wheels"),
             "counts": dict(self.counts),
-            **({"posed_by": dict(self.posed_by)} if self.posed_by else {}),
-            **({"integrity": dict(self.integrity)} if self.integrity else {}),
-            **({"segments": list(self.segments)} if self.segments else {}),
-            **({"resumed_after_scans": list(self.resumed_after)} if self.resumed_after else {}),
-            **({"keyframes": dict(self.keyframes)} if self.keyframes else {}),
-            **({"graph": dict(self.graph)} if self.graph else {}),
-            **({"refinement": dict(self.refinement)} if self.refinement else {}),
-            **({"georeference": dict(self.georeference)} if self.georeference else {}),
-            **({"localization": dict(self.localization)} if self.localization else {}),
+            **self._sections(
+                "posed_by", "integrity", "segments", "resumed_after_scans", "keyframes", "graph", "refinement"
+            ),
+            **self._sections("georeference", "localization"),
             **({"map_points": self.map_points} if self.map_points is not None else {}),
             **({"map_colour": asdict(self.map_colour)} if self.map_colour is not None else {}),
             "timings": {name: round(seconds, 3) for name, seconds in self.timings.items()},
@@ -209,6 +204,10 @@ class Manifest:
             "written": datetime.now(UTC).isoformat(timespec="seconds"),
             "machine": machine_facts(),
         }
+
+    def _sections(self, *names: str) -> dict[str, Any]:
+        """Copies of what is known of these; the others stay away."""
+        return {name: copy(value) for name in names if (value := getattr(self, name))}
 
 
 def machine_facts() -> dict[str, str | None]:

@@ -7,7 +7,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -22,15 +22,13 @@ from lslam.io.formats.atomic import atomic_write, write_text
 from lslam.io.formats.geojson import write_line
 from lslam.io.formats.ply_files import write_ply_mesh
 from lslam.io.formats.point_files import MAP_SUFFIXES, write_cloud, write_ply
-from lslam.maps.floor_plan import floor_plan
+from lslam.maps.colour import ColourCounts
+from lslam.maps.floor_plan import TopView, floor_plan
 from lslam.maps.georeference import ProjectedCloud, Projection, to_lat_lon
 from lslam.maps.mesh import surface
 from lslam.maps.occupancy import OccupancyGrid
 from lslam.reports.evaluations import strict
 from lslam.reports.png import grey_png
-
-if TYPE_CHECKING:
-    from lslam.pipeline.map_pass import BuiltMap
 
 Note = dict[str, Any]
 SCHEMA = "lslam-map"
@@ -87,10 +85,10 @@ def _notes(path: Path) -> dict[str, Note]:
     """Notes by file name, the last written first, without missing files and names that no map has."""
     tree = read_json(path.with_suffix(".json"))
     others = tree.pop("others", None)
-    told = {str(tree.get("file")): tree, **(others if isinstance(others, dict) else {})}
+    entries = {str(tree.get("file")): tree, **(others if isinstance(others, dict) else {})}
     return {
         name: note
-        for name, note in told.items()
+        for name, note in entries.items()
         if isinstance(note, dict) and _is_of(path, name) and path.with_name(name).is_file()
     }
 
@@ -106,6 +104,23 @@ def _join(notes: dict[str, Note]) -> Note:
 
 
 @dataclass(frozen=True)
+class BuiltMap:
+    """Result of building a map: the merged cloud, its top view, and a sample of its points for pages.
+
+    Also the processing steps, in words, the occupancy if requested, the numbers of a coloured map, and the meaning of each
+    attribute of its points.
+    """
+
+    cloud: Cloud
+    view: TopView
+    sample: ArrayCloud
+    steps: tuple[str, ...] = ()
+    occupancy: OccupancyGrid | None = None
+    colour: ColourCounts | None = None
+    attributes: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class MapNote:
     """Facts that a map file cannot hold: source sequence, voxel edge, m, and processing steps.
 
@@ -114,22 +129,30 @@ class MapNote:
 
     sequence: str
     voxel: float
-    done: tuple[str, ...] = ()
+    steps: tuple[str, ...] = ()
     world: str = LOCAL
     attributes: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
     def of(cls, sequence: str, config: MapConfig, built: BuiltMap, world: str) -> MapNote:
         """Note for the map of a run, by its configuration, in its `world`."""
-        return cls(sequence, config.voxel, built.done, f"{LOCAL}: {world}", built.attributes)
+        return cls(sequence, config.voxel, built.steps, f"{LOCAL}: {world}", built.attributes)
 
-    @property
-    def attributes_note(self) -> dict[str, Any]:
-        """The attributes, for JSON; empty without any."""
-        return {"attributes": dict(self.attributes)} if self.attributes else {}
+    def facts(self, projection: Projection | None, georeference: Georeference | None) -> dict[str, Any]:
+        """Facts for JSON; projection : to the coordinates of the file, None where they are those of the world."""
+        return {
+            "frame": self.world if projection is None else projection.frame,
+            "crs": None if projection is None else projection.name,
+            "georeference": None if georeference is None else georeference_note(georeference),
+            "voxel": self.voxel,
+            "done": list(self.steps),
+            **({"attributes": dict(self.attributes)} if self.attributes else {}),
+            "sequence": self.sequence,
+            "lslam": __version__,
+        }
 
 
-def write_built(
+def write_run_map(
     path: Path,
     built: BuiltMap,
     config: MapConfig,
@@ -143,31 +166,39 @@ def write_built(
     Raises as `write_map`.
     """
     note = MapNote.of(sequence, config, built, world)
-    write_map(path, built.merged, note, georeference)
+    write_map(path, built.cloud, note, georeference)
     if config.mesh:
-        write_mesh(path.with_name(f"{path.stem}_mesh.ply"), built.merged, note, trajectory)
+        write_mesh(path.with_name(f"{path.stem}_mesh.ply"), built.cloud, note, trajectory)
     if built.occupancy is not None:
         write_occupancy(path.parent, built.occupancy, note.world)
     if georeference is not None:
         write_geojson(path.parent / "trajectory.geojson", trajectory, georeference, sequence)
 
 
+def projection_of(georeference: Georeference | None, suffix: str) -> Projection | None:
+    """Projection to the coordinates of a file of a georeferenced map, None for one in the world of the run.
+
+    LAS and LAZ are in its coordinate reference system; PLY and PCD hold float32, which is too coarse for that.
+    Raises UsageError when the coordinate reference system is not one of metres.
+    """
+    if georeference is None or suffix.lower() not in (".las", ".laz"):
+        return None
+    projection = Projection(georeference)
+    projection.check()
+    return projection
+
+
 def write_map(path: Path, cloud: Cloud, note: MapNote, georeference: Georeference | None = None) -> None:
     """Write the cloud, world frame, m, in the format of the suffix, and its note `<stem>.json` beside it.
 
-    LAS and LAZ of a georeferenced run are in its coordinate reference system; PLY and PCD hold float32, which is too coarse
-    for that: they stay in the run's world, and the note says how to go on. Raises as `write_cloud`, and UsageError when the
-    coordinate reference system is not one of metres.
+    Coordinates are those of `projection_of`; the note says how to go on. Raises as `write_cloud` and `projection_of`.
     """
-    projection = None if georeference is None else Projection(georeference)
-    projected = projection is not None and path.suffix.lower() in (".las", ".laz")
-    where = "not georeferenced" if projection is None else projection.name if projected else "local"
-    comment = f"lslam {__version__} map, {where}; {note.world}"
-    if projection is not None and projected:
-        projection.check()
-        write_cloud(path, ProjectedCloud(cloud, projection.apply), wkt=projection.wkt)
+    projection = projection_of(georeference, path.suffix)
+    if projection is None:
+        where = "not georeferenced" if georeference is None else "local"
+        write_cloud(path, cloud, comment=f"lslam {__version__} map, {where}; {note.world}")
     else:
-        write_cloud(path, cloud, comment=comment)
+        write_cloud(path, ProjectedCloud(cloud, projection.apply), wkt=projection.wkt)
     about = {
         "schema": SCHEMA,
         "version": 1,
@@ -175,14 +206,7 @@ def write_map(path: Path, cloud: Cloud, note: MapNote, georeference: Georeferenc
         "points": len(cloud),
         "unit": "m",
         "intensity": cloud.has_intensity,
-        "frame": projection.frame if projection is not None and projected else note.world,
-        "crs": projection.name if projection is not None and projected else None,
-        "georeference": None if georeference is None else georeference_note(georeference),
-        "voxel": note.voxel,
-        "done": list(note.done),
-        **note.attributes_note,
-        "sequence": note.sequence,
-        "lslam": __version__,
+        **note.facts(projection, georeference),
     }
     write_json(path.with_suffix(".json"), note_with(path, about))
 
@@ -221,8 +245,8 @@ def write_occupancy(folder: Path, grid: OccupancyGrid, world: str) -> None:
 
 def write_mesh(path: Path, cloud: Cloud, note: MapNote, trajectory: Trajectory) -> None:
     """Write a surface through the map as PLY, world frame, m."""
-    made = surface(in_memory(cloud), note.voxel, trajectory.positions)
-    write_ply_mesh(path, made.vertices, made.triangles, f"lslam {__version__} map surface; {note.world}")
+    mesh = surface(in_memory(cloud), note.voxel, trajectory.positions)
+    write_ply_mesh(path, mesh.vertices, mesh.triangles, f"lslam {__version__} map surface; {note.world}")
 
 
 def georeference_note(georeference: Georeference) -> dict[str, Any]:
@@ -233,14 +257,10 @@ def georeference_note(georeference: Georeference) -> dict[str, Any]:
         "enu": "transverse Mercator at the origin, scale 1, WGS84: east, north, height above the origin, m",
         "epsg": Projection(georeference).epsg,
         "method": georeference.method,
-        **height_note(georeference),
+        # The zero level of the heights, where it is neither the ellipsoid nor that of the coordinate reference system.
+        **({"height_epsg": georeference.height_epsg} if georeference.height_epsg else {}),
+        **({"geoid": georeference.geoid} if georeference.geoid else {}),
     }
-
-
-def height_note(georeference: Georeference) -> dict[str, Any]:
-    """Zero level of the heights, where it is neither the ellipsoid nor that of the coordinate reference system."""
-    said = {"height_epsg": georeference.height_epsg, "geoid": georeference.geoid}
-    return {name: value for name, value in said.items() if value}
 
 
 def georeference_of(note: Any) -> Georeference | None:

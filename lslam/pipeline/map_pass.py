@@ -1,12 +1,13 @@
-"""Second pass over the raw scans: the merged map, from the final poses."""
+"""Second pass over the raw scans: the merged map and the attributes of its points, from the final poses."""
 
 from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
@@ -18,86 +19,68 @@ from lslam.core.errors import InputError, InterruptedRunError
 from lslam.core.geometry.se3 import poses_at
 from lslam.core.stopping import asking
 from lslam.core.types.arrays import Floats
-from lslam.core.types.cloud import ArrayCloud, Cloud, in_memory, thin_out
+from lslam.core.types.cloud import Cloud, in_memory, thin_out
 from lslam.core.types.motion_prior import MotionPrior
-from lslam.core.types.scan import Scan
+from lslam.core.types.scan import NO_RING, Scan
 from lslam.core.types.scan_result import ScanResult
-from lslam.core.types.sequence import Sequence
+from lslam.core.types.sequence import Sequence, readable
 from lslam.core.types.state import State
+from lslam.io.formats.text_tables import is_unix_time
 from lslam.maps.clean import Cleaner, PosedScan
-from lslam.maps.colour import ColourCounts
 from lslam.maps.every_point import PointCollector
-from lslam.maps.floor_plan import TopView, pixel_size, top_view
+from lslam.maps.floor_plan import pixel_size, top_view
 from lslam.maps.merge import MapMerger
 from lslam.maps.mesh import denoise
 from lslam.maps.observations import Observations
-from lslam.maps.occupancy import OccupancyGrid, OccupancyMapper
+from lslam.maps.occupancy import OccupancyMapper
 from lslam.odometry.frontend.checkpoints import Checkpoints
 from lslam.odometry.frontend.register_scans import read_ahead
 from lslam.odometry.frontend.tracker import ScanInput
 from lslam.odometry.inertial.constant_velocity import Course
-from lslam.pipeline.map_attributes import attribute_notes, with_attributes
+from lslam.pipeline.map_files import BuiltMap
 from lslam.pipeline.run_folder import CHECKPOINT, RunFolder
+from lslam.pipeline.watch import SILENT, Watch
 from lslam.registration.preprocessing.deskew import deskew_points, knots_over
 from lslam.registration.preprocessing.ground import Z, world_up_of
+from lslam.registration.preprocessing.views import with_rings
 
 log = logging.getLogger("lslam")
 
 SAMPLE = 150_000  # points that a page shows in 3D: 12 bytes each in it, and 4 of their colour
-SHOWN = ("red", "green", "blue", "class")
+COLUMNS = ("red", "green", "blue", "class")  # of it
 INTERRUPTED = "interrupted while the map was built: nothing of it is written"
-
-
-@dataclass(frozen=True)
-class BuiltMap:
-    """Result of building a map: the merged map, its top view, and a sample of its points for pages.
-
-    Also the processing steps, in words, the occupancy if requested, the numbers of a coloured map, and the meaning of each
-    attribute of its points.
-    """
-
-    merged: Cloud
-    view: TopView
-    sample: ArrayCloud
-    done: tuple[str, ...] = ()
-    occupancy: OccupancyGrid | None = None
-    colour: ColourCounts | None = None
-    attributes: Mapping[str, str] = field(default_factory=dict)
+Offer = Callable[[int, bool], None]
+KEY = "map.attributes"
+_LOOKED_AT = 5  # scans, the first that can be read
 
 
 def build_map(
     sequence: Sequence,
     results: list[ScanResult],
     config: Config,
-    on_step: Callable[[], None],
-    should_stop: Callable[[], bool],
+    watch: Watch = SILENT,
     spool: Path | None = None,
     checkpoints: MapCheckpoints | None = None,
 ) -> BuiltMap:
     """Merge every registered scan.
 
     Bridged scans, and scans of another frame, are left out: their error would enter the map. A map too large for memory is
-    kept in a temporary folder in `spool`. Raises InterruptedRunError when `should_stop` says so; `checkpoints` then allow to
+    kept in a temporary folder in `spool`. Raises InterruptedRunError when `watch` says so; `checkpoints` then allow to
     continue.
     """
     section = config.map
     poses = np.stack([r.T_world_lidar for r in results])
     up = world_up_of(config.preprocess, poses[0])
-
-    def make() -> MapMaker:
-        return MapMaker(section, spool, None if checkpoints is None else checkpoints.folder, up)
-
-    maker, done = (make(), 0) if checkpoints is None else checkpoints.begin(make, poses)
-    numbers = range(maker.first_again(done), len(results))
+    maker, count, offer = begin_pass(checkpoints, lambda keep: MapMaker(section, spool, keep, up), poses)
+    numbers = range(maker.first_again(count), len(results))
     sequence = with_attributes(sequence, config)
-    poser, offer = scan_poser(results, config), None if checkpoints is None else partial(checkpoints.offer, maker)
-    for k, loaded in scans_again(sequence, poser, numbers, config, on_step, should_stop, INTERRUPTED, done, offer):
-        if loaded.prepared is not None:
-            maker.add(k, loaded.prepared)
-    with asking(should_stop, INTERRUPTED):
-        built = replace(maker.finish(), attributes=attribute_notes(section, results[0].stamp_ns))
-    dropped = ", ".join(config.preprocess.drop_labels)
-    return replace(built, done=(*built.done, f"without points of {dropped}")) if dropped else built
+    for k, scan in posed_scans(sequence, results, config, watch, INTERRUPTED, numbers, count, offer):
+        if scan is not None:
+            maker.add(k, scan)
+    with asking(watch.should_stop, INTERRUPTED):
+        result = replace(maker.finish(), attributes=attribute_notes(section, results[0].stamp_ns))
+    labels = ", ".join(config.preprocess.drop_labels)
+    return replace(result, steps=(*result.steps, f"without points of {labels}")) if labels else result
 
 
 def scans_again(
@@ -105,29 +88,44 @@ def scans_again(
     prepare: Callable[[Scan], Any],
     numbers: range,
     config: Config,
-    on_step: Callable[[], None],
-    should_stop: Callable[[], bool],
-    interrupted: str,
-    done: int = 0,
-    offer: Callable[[int, bool], None] | None = None,
+    watch: Watch,
+    message: str,
+    count: int = 0,
+    offer: Offer | None = None,
 ) -> Iterator[tuple[int, ScanInput]]:
     """Second pass over raw scans: their numbers, and the results of `prepare`, which runs ahead in a thread.
 
-    interrupted : message of the InterruptedRunError that is raised when `should_stop` says so
-    done : number of scans that an earlier pass has done; offer : is called with each further number, and whether it is the last
+    message : of the InterruptedRunError that is raised when `watch` says so
+    count : scans that an earlier pass has done; offer : is called with each further number, and whether it is the last
     """
-    for _ in range(done):
-        on_step()
+    for _ in range(count):
+        watch.on_step()
     ahead = read_ahead(sequence, prepare, config.input.workers, first=numbers.start)
     for k, loaded in zip(numbers, ahead, strict=False):
-        is_last = should_stop()
-        if offer is not None and k >= done:
+        is_last = watch.should_stop()
+        if offer is not None and k >= count:
             offer(k, is_last)
         if is_last:
-            raise InterruptedRunError(interrupted)
+            raise InterruptedRunError(message)
         yield k, loaded
-        if k >= done:
-            on_step()
+        if k >= count:
+            watch.on_step()
+
+
+def posed_scans(
+    sequence: Sequence,
+    results: list[ScanResult],
+    config: Config,
+    watch: Watch,
+    message: str,
+    numbers: range | None = None,
+    count: int = 0,
+    offer: Offer | None = None,
+) -> Iterator[tuple[int, PosedScan | None]]:
+    """As `scans_again`, of all scans by default: each deskewed and at its pose; None for one that is not registered."""
+    numbers = range(len(results)) if numbers is None else numbers
+    for k, loaded in scans_again(sequence, scan_poser(results, config), numbers, config, watch, message, count, offer):
+        yield k, loaded.prepared
 
 
 def scan_poser(results: list[ScanResult], config: Config) -> Callable[[Scan], PosedScan | None]:
@@ -139,10 +137,10 @@ def scan_poser(results: list[ScanResult], config: Config) -> Callable[[Scan], Po
     results = [result.at_stamp for result in results]
     # Poses in frames of their own tell nothing of the motion in this one.
     here = [result for result in results if not result.frame]
-    course, registered = course_of(here), {result.index: result for result in here if result.status == "ok"}
+    course, by_index = course_of(here), {result.index: result for result in here if result.status == "ok"}
 
     def pose_scan(scan: Scan) -> PosedScan | None:
-        result = registered.get(scan.index)
+        result = by_index.get(scan.index)
         if result is None:
             return None
         scan = scan if ego_box is None else without_box(scan, ego_box)
@@ -180,11 +178,11 @@ class MapMaker:
                 spool=spool,
                 keep=None if keep is None else keep / "occupancy",
             )
-        self._given: list[int] = []
+        self._numbers: list[int] = []
 
     def add(self, number: int, scan: PosedScan) -> None:
         """Add a registered scan, and its number among all scans."""
-        self._given.append(number)
+        self._numbers.append(number)
         self._merge([scan] if self._cleaner is None else self._cleaner.add(scan))
 
     def finish(self) -> BuiltMap:
@@ -192,50 +190,44 @@ class MapMaker:
         if self._cleaner is not None:
             self._merge(self._cleaner.finish())
             log.info("map: %d of %d points moved and are left out", self._cleaner.removed, self._cleaner.seen)
-        merged: Cloud = self._merger.result()
-        done = _done(self._section, self._cleaner)
+        cloud: Cloud = self._merger.result()
+        steps = [] if self._section.crop is None else [f"cropped to {list(self._section.crop)}"]
+        if self._cleaner is not None:
+            steps.append(f"cleaned: {self._cleaner.removed} of {self._cleaner.seen} points moved")
         if self._section.denoise:
-            before, merged = len(merged), denoise(in_memory(merged))
-            done = (*done, f"denoised: {before - len(merged)} of {before} points were far from their neighbours")
-        view = top_view(merged, pixel_size(self._section.voxel))
+            before, cloud = len(cloud), denoise(in_memory(cloud))
+            steps.append(f"denoised: {before - len(cloud)} of {before} points were far from their neighbours")
+        view = top_view(cloud, pixel_size(self._section.voxel))
         occupancy = None if self._occupancy is None else self._occupancy.result()
-        return BuiltMap(merged, view, thin_out(merged, SAMPLE, SHOWN), done, occupancy)
+        return BuiltMap(cloud, view, thin_out(cloud, SAMPLE, COLUMNS), tuple(steps), occupancy)
 
     def state(self) -> State:
         """State for `restore`; voxels and cells are written to `keep`."""
         parts = {"merger": self._merger, "cleaner": self._cleaner, "occupancy": self._occupancy}
         return {name: part.state() for name, part in parts.items() if part is not None} | {
-            "given": np.array(self._given, np.int64)
+            "given": np.array(self._numbers, np.int64)
         }
 
     def restore(self, state: State) -> None:
         """Restore `state` in an empty maker of the same kind. Raises InputError when voxels are missing."""
         self._merger.restore(state["merger"])
-        self._given = state["given"].tolist()
+        self._numbers = state["given"].tolist()
         if self._occupancy is not None:
             self._occupancy.restore(state["occupancy"])
         if self._cleaner is not None:
-            del self._given[self._cleaner.restore(state["cleaner"]) :]
+            del self._numbers[self._cleaner.restore(state["cleaner"]) :]
 
     def first_again(self, done: int) -> int:
         """Number of the scan from which reading must begin again after `done` scans, since the cleaner looks back."""
         if self._cleaner is None or not done:
             return done
-        return self._given[-1] + 1 if self._given else 0
+        return self._numbers[-1] + 1 if self._numbers else 0
 
     def _merge(self, scans: Iterable[PosedScan]) -> None:
         for posed in scans:
             self._merger.add(posed.points, posed.T_world_lidar, posed.intensity, posed.observations)
             if self._occupancy is not None:
                 self._occupancy.add(posed.points, posed.T_world_lidar)
-
-
-def _done(section: MapConfig, cleaner: Cleaner | None) -> tuple[str, ...]:
-    """Processing steps of the map, in words."""
-    done = [] if section.crop is None else [f"cropped to {list(section.crop)}"]
-    if cleaner is not None:
-        done.append(f"cleaned: {cleaner.removed} of {cleaner.seen} points moved")
-    return tuple(done)
 
 
 def without_box(scan: Scan, box: tuple[float, ...]) -> Scan:
@@ -255,8 +247,8 @@ def course_of(results: list[ScanResult]) -> Course:
 
 def motion_within(scan: Scan, course: Course) -> MotionPrior:
     """Motion of the sensor during a sweep, from the final poses of the scans round it; one pose if they do not tell."""
-    times, known = knots_over(scan.span), len(course.instants_ns)
-    if len(times) < 2 or known < 2:
+    times = knots_over(scan.span)
+    if len(times) < 2 or len(course.instants_ns) < 2:
         return MotionPrior.at_once(np.eye(4))
     poses = course.at(scan.stamp_ns, times)
     if poses is None:
@@ -312,9 +304,62 @@ class MapCheckpoints:
             self._checkpoints.write(scans, lambda: {"poses": self._poses, "scans": scans, "maker": maker.state()})
 
 
+def begin_pass(
+    checkpoints: MapCheckpoints | None, make: Callable[[Path | None], M], poses: Floats
+) -> tuple[M, int, Offer | None]:
+    """What a pass over scans at `poses` (N, 4, 4) begins with: its builder, the number of scans that this has taken already,
+    and a function that offers it a checkpoint.
+
+    make : new builder, by the folder for its voxels, None where it needs none
+    """
+    if checkpoints is None:
+        return make(None), 0, None
+    maker, count = checkpoints.begin(partial(make, checkpoints.folder), poses)
+    return maker, count, partial(checkpoints.offer, maker)
+
+
 def map_checkpoints(folder: RunFolder, config: Config, what: str = "map") -> MapCheckpoints | None:
     """Checkpoints of a run folder; None when they are not wanted."""
     every_s = config.odometry.checkpoint_s
     if every_s == 0:
         return None
     return MapCheckpoints(Checkpoints(folder.path / CHECKPOINT, what.replace(" ", "-"), every_s), what)
+
+
+def needs_labels(section: MapConfig) -> bool:
+    """Whether points need labels for the attributes of the map."""
+    return "class" in section.attributes
+
+
+def with_attributes(sequence: Sequence, config: Config) -> Sequence:
+    """Sequence with rings, where the map wants them and the points have none; points without a ring stay.
+
+    Raises InputError where no rings can be found.
+    """
+    if "ring" not in config.map.attributes:
+        return sequence
+    scans = [scan for _, scan in islice(readable(range(len(sequence)), sequence.scan), _LOOKED_AT)]
+    if not scans or any(scan.rings is not None for scan in scans):
+        return sequence
+    try:
+        return with_rings(sequence, config.input.rings, is_strict=False)
+    except InputError as error:
+        raise InputError(f"{error}; or leave ring out of {KEY}") from None
+
+
+def attribute_notes(section: MapConfig, first_ns: int) -> dict[str, str]:
+    """Meaning of each attribute, for people, by its name; first_ns : earliest stamp of the recording."""
+    clock = "Unix time in PLY and PCD, adjusted standard GPS time (less 1e9 s) in LAS and LAZ"
+    if "time" in section.attributes and not is_unix_time(first_ns):
+        clock = "the recording's own seconds, which are no Unix time; LAS and LAZ mark them as GPS week time"
+        log.warning("map: stamps of the recording are no Unix time: points keep its own seconds")
+    own = {
+        "time": f"s; {clock}",
+        "scan": "number in the recording, from 0",
+        "ring": f"number of the beam; {NO_RING} where it has none",
+        "range": "m, from the sensor, as measured",
+        "observations": "number of points averaged",
+        "class": "label in the recording; in LAS and LAZ also classification, of SemanticKITTI's numbers",
+    }
+    nearest = "" if section.voxel == 0 else "; of the observation nearest to the sensor"
+    return {name: own[name] + (nearest if name != "observations" else "") for name in section.attributes}

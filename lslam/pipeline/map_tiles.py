@@ -1,10 +1,12 @@
-"""Map in square tiles with an index, each a file; one tile is in memory at a time."""
+"""Map in square tiles with an index, each a file, of which one is in memory at a time; and a map, tiles or not, as a prior."""
 
 from __future__ import annotations
 
+import json
+import logging
 import os
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -12,8 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.core import __version__
+from lslam.backend.localization.prior_map import PriorMap, make_prior_map
+from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.errors import (
+    ConfigError,
     InputError,
     InterruptedRunError,
     OutputError,
@@ -21,22 +25,51 @@ from lslam.core.errors import (
     UsageError,
     output_errors,
 )
-from lslam.core.types.cloud import ArrayCloud, Cloud
+from lslam.core.types.arrays import Floats
+from lslam.core.types.cloud import TIME_NS, ArrayCloud, Cloud
 from lslam.core.types.gnss import Georeference, OutputCrs
 from lslam.core.types.sequence import Sequence
+from lslam.io.formats.atomic import write_text
 from lslam.io.formats.copc_files import SUFFIX as COPC
-from lslam.io.formats.point_files import read_cloud, write_cloud
-from lslam.maps.georeference import ProjectedCloud, Projection
-from lslam.pipeline.colour_pass import build_finished_map
-from lslam.pipeline.map_files import MapNote, georeference_note, read_json, write_json
+from lslam.io.formats.las_files import is_extra
+from lslam.io.formats.point_files import MAP_SUFFIXES, SUFFIXES, read_cloud, write_cloud
+from lslam.io.formats.text_tables import utc_of
+from lslam.maps.georeference import ProjectedCloud, Projection, to_wgs84
+from lslam.pipeline.further_passes import build_finished_map
+from lslam.pipeline.map_files import (
+    MapNote,
+    georeference_of,
+    in_own_world,
+    note_of,
+    projection_of,
+    read_json,
+    write_json,
+)
 from lslam.pipeline.map_pass import INTERRUPTED
-from lslam.pipeline.rebuild import EarlierRun, place_of, results_of
-from lslam.pipeline.run_folder import SPOOL
-from lslam.pipeline.tile_index import VPC, vpc_item, write_vpc
+from lslam.pipeline.merge_runs import read_session
+from lslam.pipeline.rebuild import EarlierRun, map_of, place_of, results_of
+from lslam.pipeline.run_folder import SPOOL, require_run
+from lslam.pipeline.watch import SILENT, Watch
+from lslam.registration.preprocessing.ground import Z
 
+log = logging.getLogger("lslam")
 INDEX, SCHEMA = "map.json", 1
 # Points that wait for their tiles' files, so that a map of any size needs little memory and few open files.
-BUFFERED = 1 << 22
+MOST_WAITING = 1 << 22
+# Index of the tiles as a virtual point cloud: STAC items of the files, which QGIS opens as one layer.
+VPC = "tiles.vpc"
+_EXTENSIONS = ("pointcloud/v1.0.0", "projection/v1.1.0")
+_KINDS = {"f": "floating", "u": "unsigned", "i": "signed"}
+# Names of PDAL for the columns that have a field in LAS.
+_DIMENSIONS: dict[str, tuple[str, np.dtype[Any]]] = {
+    TIME_NS: ("GpsTime", np.dtype(np.float64)),
+    "scan": ("PointSourceId", np.dtype(np.uint16)),
+    "class": ("Classification", np.dtype(np.uint8)),
+    **{name.lower(): (name, np.dtype(np.uint16)) for name in ("Red", "Green", "Blue")},
+}
+_UNKNOWN = "1970-01-01T00:00:00Z"  # as the header of the LAS files
+# m; coordinates beyond are those of a projection, which a trajectory in float32 plots and maps would lose centimetres of.
+LARGE, KILOMETRE = 1e5, 1000.0
 
 
 def rebuild_in_tiles(
@@ -46,19 +79,18 @@ def rebuild_in_tiles(
     size: float,
     *,
     crs: OutputCrs | None = None,
-    on_step: Callable[[], None] = lambda: None,
-    should_stop: Callable[[], bool] = lambda: False,
+    watch: Watch = SILENT,
 ) -> dict[str, Any]:
     """Build the map of a run again, in tiles of `size` m, in `folder`, checked by `check_tiles`. Returns the index.
 
     Raises as `rebuild` does.
     """
     georeference = place_of(run, crs)
-    built = build_finished_map(sequence, results_of(run), run.config, on_step, should_stop, folder)
-    if should_stop():
+    built = build_finished_map(sequence, results_of(run), run.config, watch, folder)
+    if watch.should_stop():
         raise InterruptedRunError(INTERRUPTED)
     note = MapNote.of(sequence.name, run.config.map, built, run.world)
-    return write_tiles(folder, built.merged, note, size, run.config.map.format, georeference)
+    return write_tiles(folder, built.cloud, note, size, run.config.map.format, georeference)
 
 
 def write_tiles(
@@ -68,26 +100,23 @@ def write_tiles(
 
     Tiles in LAZ are COPC, `.copc.laz`; of a georeferenced run `tiles.vpc` makes them one layer of QGIS.
 
-    Tile X, Y holds X * size <= x < (X + 1) * size, m, of the world, or of the coordinate reference system in LAS and LAZ of a
-    georeferenced run. Raises OutputError, and UsageError for coordinates that no map can be written in.
+    Tile X, Y holds X * size <= x < (X + 1) * size, m, in the coordinates of `projection_of`. Raises OutputError, and
+    UsageError for coordinates that no map can be written in.
     """
-    projection = None if georeference is None else Projection(georeference)
-    is_projected = projection is not None and suffix in ("las", "laz")
-    if projection is not None and is_projected:
-        projection.check()
+    projection = projection_of(georeference, f".{suffix}")
+    if projection is not None:
         cloud = ProjectedCloud(cloud, projection.apply)
     tiles, items = [], []
     ending = COPC if suffix == "laz" else f".{suffix}"
     with tempfile.TemporaryDirectory(prefix=SPOOL, dir=folder, ignore_cleanup_errors=True) as stage:
         for key, tile in _sorted_into(cloud, size, Path(stage)):
             path = Path(stage) / f"tile_{key[0]}_{key[1]}{ending}"
-            write_cloud(path, tile, wkt=projection.wkt if projection is not None and is_projected else "")
+            write_cloud(path, tile, wkt="" if projection is None else projection.wkt)
             low, high = tile.points.min(axis=0), tile.points.max(axis=0)
-            if projection is not None and is_projected and ending == COPC:
+            if projection is not None and ending == COPC:
                 items.append(vpc_item(path.name, tile, projection))
             tiles.append({"file": path.name, "points": len(tile), "low": low.tolist(), "high": high.tolist()})
         _publish(Path(stage), folder, {tile["file"] for tile in tiles})
-    crs = projection.name if projection is not None and is_projected else None
     index: dict[str, Any] = {
         "schema": SCHEMA,
         "kind": "tiles",
@@ -95,17 +124,10 @@ def write_tiles(
         "unit": "m",
         "points": len(cloud),
         "tiles": tiles,
-        "frame": note.world if projection is None or crs is None else projection.frame,
-        "crs": crs,
-        "georeference": None if georeference is None else georeference_note(georeference),
-        "voxel": note.voxel,
-        "done": list(note.done),
-        **note.attributes_note,
-        "sequence": note.sequence,
-        "lslam": __version__,
+        **note.facts(projection, georeference),
     }
     if items:
-        write_vpc(folder, items)
+        write_text(folder / VPC, json.dumps({"type": "FeatureCollection", "features": items}, indent=1) + "\n")
     write_json(folder / INDEX, index)
     return index
 
@@ -128,7 +150,7 @@ def _sorted_into(cloud: Cloud, size: float, spool: Path) -> Iterator[tuple[tuple
         [("points", np.float64, (3,)), ("intensity", np.float32), ("columns", list(cloud.column_types.items()))]
     )
     waiting: dict[tuple[int, int], list[NDArray[Any]]] = {}
-    held, keys = 0, set[tuple[int, int]]()
+    count, keys = 0, set[tuple[int, int]]()
     with output_errors(f"the tiles in {spool.parent}"):
         for block in cloud.blocks():
             table = np.empty(len(block), record)
@@ -136,13 +158,13 @@ def _sorted_into(cloud: Cloud, size: float, spool: Path) -> Iterator[tuple[tuple
             for name, values in block.columns.items():
                 table["columns"][name] = values
             cells = np.floor(block.points[:, :2] / size).astype(np.int64)
-            found, of = np.unique(cells, axis=0, return_inverse=True)
-            for n, (x, y) in enumerate(found.tolist()):
+            tiles, of = np.unique(cells, axis=0, return_inverse=True)
+            for n, (x, y) in enumerate(tiles.tolist()):
                 waiting.setdefault((x, y), []).append(table[of.ravel() == n])
-            held += len(block)
-            if held > BUFFERED:
+            count += len(block)
+            if count > MOST_WAITING:
                 keys |= _spill(waiting, spool)
-                held = 0
+                count = 0
         keys |= _spill(waiting, spool)
         for key in sorted(keys):
             path = _part(spool, key)
@@ -194,3 +216,98 @@ def check_tiles(folder: Path, size: float, overwrite: bool) -> None:
             raise OutputError(f"{folder} is something else than tiles: name another --out")
     with output_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
+
+
+def vpc_item(name: str, tile: ArrayCloud, projection: Projection) -> dict[str, Any]:
+    """STAC item of the file `name`, whose points are in the coordinates of the projection, m."""
+    low, high = tile.points.min(axis=0), tile.points.max(axis=0)
+    box = [[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]], [low[0], low[1]]]
+    corners = [np.column_stack([box, np.full(5, z)]) for z in (low[2], high[2])]
+    georeference = projection.georeference
+    places = to_wgs84(np.concatenate(corners), projection.epsg, georeference.height_epsg, georeference.geoid)
+    places = places[:, [1, 0, 2]]
+    utc = utc_of(tile.columns[TIME_NS]) if TIME_NS in tile.columns else None
+    schemas = [_schema(axis, np.dtype(np.float64)) for axis in "XYZ"] + [_schema("Intensity", np.dtype(np.uint16))]
+    for column, kind in tile.column_types.items():
+        if column in _DIMENSIONS:
+            schemas.append(_schema(*_DIMENSIONS[column]))
+        if column not in _DIMENSIONS or is_extra(column, kind):
+            schemas.append(_schema(column, kind))
+    return {
+        "type": "Feature",
+        "stac_version": "1.0.0",
+        "stac_extensions": [f"https://stac-extensions.github.io/{one}/schema.json" for one in _EXTENSIONS],
+        "id": name.split(".")[0],
+        "geometry": {"type": "Polygon", "coordinates": [places[:5, :2].tolist()]},
+        "bbox": [*places.min(0).tolist(), *places.max(0).tolist()],
+        "properties": {
+            "datetime": _UNKNOWN if utc is None else f"{min(utc):%Y-%m-%dT%H:%M:%S}Z",
+            "pc:count": len(tile),
+            "pc:type": "lidar",
+            "pc:encoding": "LASzip",
+            "pc:schemas": schemas,
+            "proj:bbox": [*low.tolist(), *high.tolist()],
+            "proj:wkt2": projection.wkt2,
+        },
+        "links": [],
+        "assets": {"data": {"href": f"./{name}", "roles": ["data"]}},
+    }
+
+
+def _schema(name: str, kind: np.dtype[Any]) -> Mapping[str, Any]:
+    return {"name": name, "size": kind.itemsize, "type": _KINDS[kind.kind]}
+
+
+def require_map(target: Path, needs_place: bool = False) -> Path:
+    """Cloud file of a map, or its folder of tiles, without reading it. Raises InputError when there is none.
+
+    needs_place : satellite fixes are to lead into it. Raises UsageError when nobody knows where it lies on the Earth.
+    """
+    path = _cloud_file(target)
+    about = read_json(path / INDEX) if is_tiles(path) else note_of(path)
+    if needs_place and georeference_of(about.get("georeference")) is None:
+        raise UsageError(f"--gnss: {path} is not georeferenced; say where the drive begins with --start X,Y,HEADING")
+    return path
+
+
+def _cloud_file(target: Path) -> Path:
+    if is_tiles(target):
+        return target
+    if target.is_dir():
+        require_run(target)
+        return map_of(target)
+    if not target.exists():
+        raise InputError(f"the map {target} does not exist")
+    if target.suffix.lower() not in (*MAP_SUFFIXES, *SUFFIXES):
+        raise InputError(
+            f"the map {target} is no run folder and no cloud: known suffixes are {', '.join(MAP_SUFFIXES)}"
+        )
+    return target
+
+
+def read_prior_map(target: Path, config: RegistrationConfig) -> PriorMap:
+    """Read the map, in coordinates near it: those of the run, or of the file less whole kilometres.
+
+    Raises InputError naming what is missing or broken.
+    """
+    path = require_map(target)
+    if is_tiles(path):
+        cloud, index = read_tiles(path)
+        georeference = georeference_of(index.get("georeference"))
+        if index.get("crs") is not None and georeference is not None:
+            cloud = ArrayCloud(Projection(georeference).invert(cloud.points))
+    else:
+        cloud, georeference = in_own_world(path, read_cloud(path))
+    points, origin = cloud.points, np.zeros(3)
+    if len(points) and float(np.abs(points).max()) > LARGE:
+        origin = np.round(np.nanmedian(points, axis=0) / KILOMETRE) * KILOMETRE
+        log.info("coordinates of %s are large: the world of this run begins at %s of them", path, origin.tolist())
+    return make_prior_map(points, config, georeference, str(path), origin, _up_of(path.parent))
+
+
+def _up_of(folder: Path) -> Floats:
+    """(3,) up in the world of the run in a folder, by the mounting of its sensor; z by default."""
+    try:
+        return read_session(folder, folder.name)[1].up
+    except (InputError, ConfigError):
+        return Z

@@ -24,9 +24,9 @@ from lslam.core.stopping import asking
 from lslam.core.types.arrays import Floats
 from lslam.core.types.constraint import LoopCandidate
 from lslam.core.types.scan_result import ScanResult
-from lslam.core.untrusted import parse_json
 from lslam.io.formats.state_files import Records, read_npz
 from lslam.odometry.frontend.checkpoints import Checkpoints
+from lslam.pipeline.map_files import read_json
 from lslam.pipeline.rebuild import EarlierRun, read_run, results_of
 from lslam.pipeline.run_folder import KEYFRAMES, MANIFEST
 
@@ -43,7 +43,7 @@ class LeftOut:
 
 
 @dataclass(frozen=True)
-class Merged:
+class Merge:
     """Result of `merge_runs`.
 
     runs : that were merged, in the order in which they were tied; sessions : likewise, at the poses they were tied at
@@ -67,7 +67,7 @@ class Merged:
         return sum(a != b and session in (a, b) for a, b in ends)
 
 
-def expanded(folders: Sequence[Path]) -> list[Path]:
+def expand_folders(folders: Sequence[Path]) -> list[Path]:
     """Run folders, where a merged folder is replaced by its runs.
 
     Raises InputError for a folder that is no run, UsageError for fewer than two or a duplicate.
@@ -76,10 +76,9 @@ def expanded(folders: Sequence[Path]) -> list[Path]:
     for folder in folders:
         inside = sessions_of(folder)
         out += [folder] if inside is None else inside
-    resolved = [folder.resolve() for folder in out]
-    twice = [str(folder) for folder, count in Counter(resolved).items() if count > 1]
-    if twice:
-        raise UsageError(f"{twice[0]} is named twice")
+    for folder, count in Counter(folder.resolve() for folder in out).items():
+        if count > 1:
+            raise UsageError(f"{folder} is named twice")
     if len(out) < 2:
         raise UsageError("merging takes two runs at least")
     return out
@@ -87,11 +86,8 @@ def expanded(folders: Sequence[Path]) -> list[Path]:
 
 def sessions_of(folder: Path) -> list[Path] | None:
     """Run folders behind a merged folder, None for the folder of a single run."""
-    try:
-        manifest = parse_json((folder / MANIFEST).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-    if not isinstance(manifest, dict) or manifest.get("kind") != "merge":
+    manifest = read_json(folder / MANIFEST)
+    if manifest.get("kind") != "merge":
         return None
     return [Path(str(one["run"])) for one in manifest.get("sessions", [])]
 
@@ -117,12 +113,13 @@ def _with_covariances(run: EarlierRun) -> list[ScanResult]:
     path = run.folder / "covariances.npz"
     if not path.is_file():
         return results
-    known = read_npz(path).get("registration")
-    if known is None or known.shape != (len(results), 6, 6):
+    covariances = read_npz(path).get("registration")
+    if covariances is None or covariances.shape != (len(results), 6, 6):
         return results
     # Of the registration alone: how a pose graph spread the rest over the keyframes is not how it grows.
     return [
-        r if np.isnan(C).any() else replace(r, registration_covariance=C) for r, C in zip(results, known, strict=True)
+        r if np.isnan(C).any() else replace(r, registration_covariance=C)
+        for r, C in zip(results, covariances, strict=True)
     ]
 
 
@@ -132,11 +129,11 @@ def merge_runs(
     should_stop: Stop = lambda: False,
     on_stage: Callable[[str], None] = lambda stage: None,
     checkpoints: Checkpoints | None = None,
-) -> Merged:
+) -> Merge:
     """Connect the sessions, find loops, optimise.
 
     The first run defines the world. Raises RunFailedError when no other can be connected to it, InterruptedRunError when
-    `should_stop` says so; InputError and UsageError as `expanded` and `read_session`.
+    `should_stop` says so; InputError and UsageError as `expand_folders` and `read_session`.
     """
     read = [read_session(folder, name) for folder, name in zip(folders, names_of(folders), strict=True)]
     warm_up(config.loops)
@@ -152,10 +149,10 @@ def merge_runs(
         on_stage("loops")
         candidates = _loops(chain, config, should_stop, checkpoints)
         on_stage("graph")
-        merged = _solve(chain, candidates, config, runs, left_out, should_stop)
-        loose = [n for n in range(1, len(tied)) if merged.between(n) == 0]
+        merge = _solve(chain, candidates, config, runs, left_out, should_stop)
+        loose = [n for n in range(1, len(tied)) if merge.between(n) == 0]
         if not loose:
-            return merged
+            return merge
         left_out += [LeftOut(tied[n].name, "no loop closure with another run holds") for n in loose]
         tied = [session for n, session in enumerate(tied) if n not in loose]
 
@@ -179,16 +176,16 @@ def _connect(sessions: list[Session], config: Config, should_stop: Stop) -> tupl
     while waiting:
         left = []
         for session in waiting:
-            found, reason = tie(session, tied, config, should_stop)
+            placed, reason = tie(session, tied, config, should_stop)
             if should_stop():
                 raise InterruptedRunError(f"interrupted while {session.name} was searched among the other runs")
-            if found is None:
+            if placed is None:
                 why[session.name] = reason
                 left.append(session)
                 continue
-            assert found.start is not None
-            log.info("%s: found by %d of %d keyframes tried", found.name, found.start.votes, found.start.tried)
-            tied.append(found)
+            assert placed.start is not None
+            log.info("%s: found by %d of %d keyframes tried", placed.name, placed.start.votes, placed.start.tried)
+            tied.append(placed)
         if len(left) == len(waiting):
             break
         waiting = left
@@ -216,7 +213,7 @@ def _solve(
     runs: dict[str, EarlierRun],
     left_out: list[LeftOut],
     should_stop: Stop,
-) -> Merged:
+) -> Merge:
     keyframes = chain.keyframes()
     loops = [c.constraint for c in candidates if c.is_accepted and c.constraint is not None]
     graph = PoseGraph(
@@ -235,6 +232,6 @@ def _solve(
             correct_scans(session.results, session.keyframes, poses, covariances, solution.drift, config.graph)
         )
     judged, _ = apply_verdicts(candidates, graph, solution)
-    return Merged(
+    return Merge(
         [runs[s.name] for s in chain.sessions], chain.sessions, results, chain, chain.poses, solution, judged, left_out
     )

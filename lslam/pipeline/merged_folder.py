@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ import numpy as np
 from lslam.backend.graph.factors import regularise
 from lslam.core import __version__
 from lslam.core.config import Config
-from lslam.core.errors import InputError, InterruptedRunError, LslamError, OutputError, UsageError
+from lslam.core.errors import InputError, InterruptedRunError, LslamError, UsageError
 from lslam.core.geometry import se3
 from lslam.core.types.arrays import Floats
 from lslam.core.types.gnss import Georeference
@@ -26,12 +25,17 @@ from lslam.io.formats.trajectory_lines import write_g2o, write_tum
 from lslam.odometry.frontend.checkpoints import Checkpoints
 from lslam.odometry.frontend.register_scans import to_trajectory
 from lslam.pipeline.back_end_pass import describe
-from lslam.pipeline.map_attributes import attribute_notes, with_attributes
-from lslam.pipeline.map_files import MapNote, write_map
-from lslam.pipeline.map_pass import INTERRUPTED, BuiltMap, MapMaker, scan_poser, scans_again
-from lslam.pipeline.merge_runs import Merged, expanded, merge_runs
+from lslam.pipeline.map_files import BuiltMap, MapNote, write_map
+from lslam.pipeline.map_pass import (
+    INTERRUPTED,
+    MapMaker,
+    attribute_notes,
+    posed_scans,
+    with_attributes,
+)
+from lslam.pipeline.merge_runs import Merge, expand_folders, merge_runs
 from lslam.pipeline.outputs import config_text, write_loops
-from lslam.pipeline.rebuild import EarlierRun, is_gone, open_scans
+from lslam.pipeline.rebuild import EarlierRun, is_missing, open_scans
 from lslam.pipeline.run_folder import CHECKPOINT, SESSIONS, RunFolder
 from lslam.pipeline.watch import Watch
 from lslam.reports.compare_html import SessionView, write_merge_page
@@ -73,7 +77,7 @@ def merge_into(
     """
     if config.map.colour:
         raise UsageError("map.colour: merged maps have no colours; those of their runs have, by lslam map RUN --colour")
-    folders = expanded(folders)
+    folders = expand_folders(folders)
 
     def on_stage(stage: str) -> None:
         log.info("merge: %s", stage)
@@ -83,14 +87,13 @@ def merge_into(
         manifest: dict[str, Any] = {"schema": SCHEMA, "kind": "merge", "lslam": __version__, "command": command}
         folder.write_text("config.toml", config_text(config))
         folder.write_manifest({**manifest, "status": "running"})
-        kept = Checkpoints(folder.path / CHECKPOINT, "merge", config.odometry.checkpoint_s)
+        checkpoints = Checkpoints(folder.path / CHECKPOINT, "merge", config.odometry.checkpoint_s)
         try:
-            merged = merge_runs(folders, config, watch.should_stop, on_stage, kept)
-            manifest |= _fill(folder, merged, config, watch)
+            merge = merge_runs(folders, config, watch.should_stop, on_stage, checkpoints)
+            manifest |= _fill(folder, merge, config, watch)
         except BaseException as error:
             status = "interrupted" if isinstance(error, InterruptedRunError) else "failed"
-            with suppress(OutputError):
-                folder.write_manifest({**manifest, "status": status, "why": str(error) or type(error).__name__})
+            folder.write_failure({**manifest, "status": status, "why": str(error) or type(error).__name__})
             raise
         folder.write_manifest(manifest)
         folder.drop_checkpoint()
@@ -98,36 +101,36 @@ def merge_into(
     return manifest
 
 
-def _fill(folder: RunFolder, merged: Merged, config: Config, watch: Watch) -> dict[str, Any]:
+def _fill(folder: RunFolder, merge: Merge, config: Config, watch: Watch) -> dict[str, Any]:
     """Write everything but the manifest, and return the manifest's content."""
-    problems = [f"{one.name} is left out: {one.why}" for one in merged.left_out]
-    recordings = [_recording(run, config, problems) for run in merged.runs]
-    trajectories = [to_trajectory(results, "merge") for results in merged.results]
+    problems = [f"{one.name} is left out: {one.why}" for one in merge.left_out]
+    recordings = [_recording(run, config, problems) for run in merge.runs]
+    trajectories = [to_trajectory(results, "merge") for results in merge.results]
     (folder.path / SESSIONS).mkdir(exist_ok=True)
-    world = f"that of {merged.sessions[0].name}"
-    for session, trajectory in zip(merged.sessions, trajectories, strict=True):
+    world = f"that of {merge.sessions[0].name}"
+    for session, trajectory in zip(merge.sessions, trajectories, strict=True):
         comment = f"lslam {__version__}, merged: T_world_lidar of {session.name}\nworld: {world}"
         write_tum(folder.path / SESSIONS / f"{session.name}.tum", trajectory, comment=comment)
-    rows = _rows(merged, recordings, trajectories, config)
+    rows = _rows(merge, recordings, trajectories, config)
     folder.write_text("sessions.csv", "\n".join([COLUMNS, *map(_line, rows)]) + "\n")
-    numbers = [s.results[k.scan].index for s in merged.sessions for k in s.keyframes]
-    write_loops(folder.path / "loops.csv", merged.candidates, numbers)
-    accepted = [c.constraint for c in merged.candidates if c.is_accepted and c.constraint is not None]
-    constraints = [replace(c, covariance=regularise(c.covariance)) for c in (*merged.chain.odometry(), *accepted)]
-    write_g2o(folder.path / "graph.g2o", merged.solution.poses, constraints)
-    georeference = _georeference(merged)
+    numbers = [s.results[k.scan].index for s in merge.sessions for k in s.keyframes]
+    write_loops(folder.path / "loops.csv", merge.candidates, numbers)
+    accepted = [c.constraint for c in merge.candidates if c.is_accepted and c.constraint is not None]
+    constraints = [replace(c, covariance=regularise(c.covariance)) for c in (*merge.chain.odometry(), *accepted)]
+    write_g2o(folder.path / "graph.g2o", merge.solution.poses, constraints)
+    georeference = _georeference(merge)
     about: dict[str, Any] = {}
     built = None
     if config.map.write:
-        built = _map(recordings, merged.results, config, watch, folder.path, merged.sessions[0].up)
+        built = _map(recordings, merge.results, config, watch, folder.path, merge.sessions[0].up)
         note = MapNote(
-            ", ".join(s.name for s in merged.sessions), config.map.voxel, built.done, world, built.attributes
+            ", ".join(s.name for s in merge.sessions), config.map.voxel, built.steps, world, built.attributes
         )
-        write_map(folder.path / f"map.{config.map.format}", built.merged, note, georeference)
-        about["map_points"] = len(built.merged)
+        write_map(folder.path / f"map.{config.map.format}", built.cloud, note, georeference)
+        about["map_points"] = len(built.cloud)
     watch.on_start("report", 0)
-    views, shown = _views(merged, trajectories), (None, None) if built is None else (built.view, built.sample)
-    write_merge_page(folder.path / "report.html", views, [vars(row) for row in rows], problems, _ties(merged), *shown)
+    views, shown = _views(merge, trajectories), (None, None) if built is None else (built.view, built.sample)
+    write_merge_page(folder.path / "report.html", views, [vars(row) for row in rows], problems, _ties(merge), *shown)
     for problem in problems:
         log.warning("%s", problem)
     return about | {
@@ -135,12 +138,12 @@ def _fill(folder: RunFolder, merged: Merged, config: Config, watch: Watch) -> di
         "problems": problems,
         "frames": {"world": world},
         "sessions": [vars(row) for row in rows],
-        "left_out": [vars(one) for one in merged.left_out],
+        "left_out": [vars(one) for one in merge.left_out],
         "graph": {
-            "keyframes": len(merged.chain),
+            "keyframes": len(merge.chain),
             "loops": len(accepted),
-            "drift_factor": round(merged.solution.drift, 4),
-            "rounds": merged.solution.rounds,
+            "drift_factor": round(merge.solution.drift, 4),
+            "rounds": merge.solution.rounds,
         },
         **({} if georeference is None else {"georeference": describe(georeference)}),
     }
@@ -152,21 +155,21 @@ def _recording(run: EarlierRun, config: Config, problems: list[str]) -> Recordin
         scans = open_scans(replace(run, config=run.config.model_copy(update={"map": config.map})))
         return with_attributes(scans, config) if config.map.write else scans
     except InputError as error:
-        why = f"cannot be read at {run.sequence_path}" if is_gone(run) else f"cannot be used ({error})"
+        why = f"cannot be read at {run.sequence_path}" if is_missing(run) else f"cannot be used ({error})"
         problems.append(f"the raw scans of {run.folder.name} {why}: they are missing in the map")
         return None
 
 
 def _rows(
-    merged: Merged, recordings: Sequence[Recording | None], trajectories: Sequence[Trajectory], config: Config
+    merge: Merge, recordings: Sequence[Recording | None], trajectories: Sequence[Trajectory], config: Config
 ) -> list[SessionRow]:
     rows = []
     for n, (run, session, recording, trajectory) in enumerate(
-        zip(merged.runs, merged.sessions, recordings, trajectories, strict=True)
+        zip(merge.runs, merge.sessions, recordings, trajectories, strict=True)
     ):
-        part = merged.chain.part(n)
+        part = merge.chain.part(n)
         start = session.start
-        T = merged.solution.poses[part][0] @ se3.inverse(session.keyframes[0].T_world_lidar)
+        T = merge.solution.poses[part][0] @ se3.inverse(session.keyframes[0].T_world_lidar)
         rows.append(
             SessionRow(
                 session.name,
@@ -176,7 +179,7 @@ def _rows(
                 part.start,
                 0 if start is None else start.votes,
                 0 if start is None else start.tried,
-                merged.between(n),
+                merge.between(n),
                 _ate(run.trajectory, trajectory, recording, config),
                 se3.normalise(T).tolist(),
             )
@@ -211,12 +214,12 @@ def _line(row: SessionRow) -> str:
     return ",".join([*map(str, values), before, after])
 
 
-def _georeference(merged: Merged) -> Georeference | None:
+def _georeference(merge: Merge) -> Georeference | None:
     """Georeference of the common world, by the first session that has one."""
-    for n, run in enumerate(merged.runs):
+    for n, run in enumerate(merge.runs):
         if run.georeference is not None:
-            first = merged.sessions[n].keyframes[0].T_world_lidar
-            T_town_session = merged.solution.poses[merged.chain.part(n)][0] @ se3.inverse(first)
+            first = merge.sessions[n].keyframes[0].T_world_lidar
+            T_town_session = merge.solution.poses[merge.chain.part(n)][0] @ se3.inverse(first)
             return replace(run.georeference, T_enu_world=run.georeference.T_enu_world @ se3.inverse(T_town_session))
     return None
 
@@ -237,16 +240,15 @@ def _map(
     for recording, poses in zip(recordings, results, strict=True):
         if recording is None:
             continue
-        poser, numbers = scan_poser(poses, config), range(len(poses))
-        for k, loaded in scans_again(recording, poser, numbers, config, watch.on_step, watch.should_stop, INTERRUPTED):
-            if loaded.prepared is not None:
-                maker.add(number + k, loaded.prepared)
+        for k, scan in posed_scans(recording, poses, config, watch, INTERRUPTED):
+            if scan is not None:
+                maker.add(number + k, scan)
         number += len(poses)
     first_ns = min((poses[0].stamp_ns for poses in results if poses), default=0)
     return replace(maker.finish(), attributes=attribute_notes(config.map, first_ns))
 
 
-def _views(merged: Merged, trajectories: Sequence[Trajectory]) -> list[SessionView]:
+def _views(merge: Merge, trajectories: Sequence[Trajectory]) -> list[SessionView]:
     return [
         SessionView(
             session.name,
@@ -254,12 +256,12 @@ def _views(merged: Merged, trajectories: Sequence[Trajectory]) -> list[SessionVi
             after.positions,
             np.array([r.index for r in session.results]),
         )
-        for session, after in zip(merged.sessions, trajectories, strict=True)
+        for session, after in zip(merge.sessions, trajectories, strict=True)
     ]
 
 
-def _ties(merged: Merged) -> Floats:
+def _ties(merge: Merge) -> Floats:
     """(K, 2, 3) m, both ends of each loop between two sessions."""
-    session_of = merged.chain.session_of
-    ends = [(c.a, c.b) for c in merged.candidates if c.is_accepted and session_of(c.a) != session_of(c.b)]
-    return np.asarray(merged.solution.poses[np.array(ends, int).reshape(-1, 2)][..., :3, 3])
+    session_of = merge.chain.session_of
+    ends = [(c.a, c.b) for c in merge.candidates if c.is_accepted and session_of(c.a) != session_of(c.b)]
+    return np.asarray(merge.solution.poses[np.array(ends, int).reshape(-1, 2)][..., :3, 3])

@@ -42,19 +42,18 @@ from lslam.odometry.integrity.monitor import IntegrityMonitor
 from lslam.odometry.scan_outcome import measurable
 from lslam.odometry.stationary import StationaryDetector
 from lslam.pipeline.job import PreparedRun
-from lslam.pipeline.lost_scans import mark_lost
 from lslam.pipeline.manifest import Manifest
 from lslam.pipeline.precompile import COUNTS, load_kernels
 from lslam.pipeline.run_folder import CHECKPOINT, REPLIES, RunFolder
-from lslam.pipeline.segments import checks_within, join_segments
+from lslam.pipeline.segments import checks_within, join_segments, raise_alerts
 from lslam.registration.local_map import surroundings_m
 
 log = logging.getLogger("lslam")
 
-_FAULTS_NAMED = 10  # scans
+_MOST_FAULTS = 10  # scans
 # Sections that choose no kernel of scans; of buildings it is enough whether there are any.
 _WITHOUT_KERNELS = {"input", "keyframes", "graph", "gnss", "osm", "eval", "report"}
-_warmed: set[tuple[object, ...]] = set()
+_ready: set[tuple[object, ...]] = set()
 
 
 def estimate_poses(job: PreparedRun) -> RunRecord:
@@ -76,7 +75,7 @@ def estimate_poses(job: PreparedRun) -> RunRecord:
         for result in checkpoints.results:
             osm.see(result.stamp_ns, result.T_world_lidar)
 
-    def seen(result: ScanResult) -> None:
+    def take(result: ScanResult) -> None:
         if result.status != "ok":
             log.warning("scan %d %s: %s", result.index, result.status, result.reason)
         if osm is not None:
@@ -86,7 +85,7 @@ def estimate_poses(job: PreparedRun) -> RunRecord:
     watch.on_start("odometry", len(sequence) - (0 if checkpoints is None else checkpoints.scans))
     inertial = _begin_imu(job)
     motion = job.odometry.motion if isinstance(job.odometry, GivenPoses) else job.wheels.motion or inertial.motion
-    with manifest.timed("odometry_s"), Keyframing(store, config) as keyframing:
+    with manifest.time("odometry_s"), Keyframing(store, config) as keyframing:
         results = estimate(
             sequence,
             job.odometry,
@@ -96,7 +95,7 @@ def estimate_poses(job: PreparedRun) -> RunRecord:
             stationary=stationary,
             motion=motion,
             should_stop=watch.should_stop,
-            on_scan=seen,
+            on_scan=take,
             keyframing=keyframing,
             checkpoints=checkpoints,
             monitor=monitor,
@@ -105,7 +104,7 @@ def estimate_poses(job: PreparedRun) -> RunRecord:
         )
         keyframing.settle()
     if checkpoints is not None and checkpoints.resumed_after:
-        manifest.resumed_after = checkpoints.resumed_after
+        manifest.resumed_after_scans = checkpoints.resumed_after
         manifest.timings["odometry_s"] += checkpoints.seconds
     if all(r.status == "skipped" for r in results):
         raise InputError(f"{sequence.path}: none of {len(results)} scans can be used, the first: {results[0].reason}")
@@ -120,7 +119,7 @@ def estimate_poses(job: PreparedRun) -> RunRecord:
     manifest.judge(results, len(sequence), diverges(results))
     checks = [] if monitor is None else checks_within(monitor.checks, results)
     if monitor is not None:
-        results = mark_lost(results, checks, manifest)
+        results = raise_alerts(results, checks, manifest)
     return RunRecord(
         name=sequence.name,
         method=config.odometry.method,
@@ -155,8 +154,8 @@ def _begin_segment(job: PreparedRun, inertial: Inertial) -> Begin | None:
 
 
 def _stationary(config: Config) -> StationaryDetector | None:
-    is_wanted = config.preprocess.skip_standing
-    return StationaryDetector(config.preprocess, config.registration) if is_wanted else None
+    is_on = config.preprocess.skip_standing
+    return StationaryDetector(config.preprocess, config.registration) if is_on else None
 
 
 def _chain(inertial: Inertial, store: KeyframeStore, config: Config) -> InertialChain | None:
@@ -203,10 +202,10 @@ def _warm_up(job: PreparedRun, stationary: StationaryDetector | None, monitor: I
     config, is_over = job.config, job.checkpoints is not None and job.checkpoints.is_over
     alike = type(job.odometry), bool(config.osm.extract), repr(config.model_dump(exclude=_WITHOUT_KERNELS))
     count = COUNTS.get(config.odometry.method)
-    with job.manifest.timed("compile_s"), rarely_collecting(), jit.count_kernels(log, count):
-        if alike not in _warmed and not is_over:
+    with job.manifest.time("compile_s"), rarely_collecting(), jit.count_kernels(log, count):
+        if alike not in _ready and not is_over:
             load_kernels(config, [one for one in (job.odometry, stationary, monitor) if one is not None])
-            _warmed.add(alike)
+            _ready.add(alike)
         with suppress(InputError):
             measurable(job.sequence.scan(0))  # the reader's kernels; what is wrong with the scan is said in its turn
 
@@ -217,7 +216,7 @@ def _begin_imu(job: PreparedRun) -> Inertial:
     if not config.imu.use:
         return Inertial(None)
     path = None if job.checkpoints is None else job.checkpoints.folder / "imu.npz"
-    with job.manifest.timed("imu_start_s"):
+    with job.manifest.time("imu_start_s"):
         known = None if path is None else load_start(path, config)
         inertial = begin_inertial(job.sequence, config) if known is None else known
         if path is not None and known is None:
@@ -233,7 +232,7 @@ def _report_faults(results: list[ScanResult], manifest: Manifest) -> None:
     faulty = [r for r in results if r.fault]
     if not faulty:
         return
-    numbers = ", ".join(str(r.index) for r in faulty[:_FAULTS_NAMED]) + (", ..." if len(faulty) > _FAULTS_NAMED else "")
+    numbers = ", ".join(str(r.index) for r in faulty[:_MOST_FAULTS]) + (", ..." if len(faulty) > _MOST_FAULTS else "")
     manifest.problems.append(
         f"in {len(faulty)} of {len(results)} scans not all was right and the rest was used ({numbers}); scan {faulty[0].index}: "
         f"{faulty[0].fault}"

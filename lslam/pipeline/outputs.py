@@ -30,45 +30,18 @@ from lslam.io.formats.atomic import write_text
 from lslam.io.formats.point_files import write_ply
 from lslam.io.formats.trajectory_lines import write_kitti, write_tum
 from lslam.pipeline import map_files
-from lslam.pipeline.feature_map_pass import FeatureCloud
-from lslam.pipeline.map_files import LOCAL
-from lslam.pipeline.map_pass import BuiltMap
+from lslam.pipeline.further_passes import FeatureCloud
+from lslam.pipeline.map_files import LOCAL, BuiltMap
 from lslam.pipeline.run_folder import RunFolder
 from lslam.reports.evaluations import run_document
 from lslam.reports.facts import stage_matrix
 
 LOOP_COLUMNS = (
-    "keyframe_a",
-    "keyframe_b",
-    "scan_a",
-    "scan_b",
-    "distance_m",
-    "descriptor_distance",
-    "verdict",
-    "stage",
-    "rmse_m",
-    "overlap",
-    "sigma_m",
-    "sigma_deg",
-    "reason",
+    "keyframe_a,keyframe_b,scan_a,scan_b,distance_m,descriptor_distance,verdict,stage,"
+    "rmse_m,overlap,sigma_m,sigma_deg,reason"
 )
 # x, y, yaw: of the keyframe in the map frame, or of the displacement of the building about its middle.
-MATCH_COLUMNS = (
-    "keyframe",
-    "scan",
-    "building",
-    "verdict",
-    "kind",
-    "rank",
-    "walls",
-    "fitness",
-    "coverage",
-    "rms_m",
-    "x_m",
-    "y_m",
-    "yaw_deg",
-    "reason",
-)
+MATCH_COLUMNS = "keyframe,scan,building,verdict,kind,rank,walls,fitness,coverage,rms_m,x_m,y_m,yaw_deg,reason"
 
 
 def write_loops(path: Path, candidates: Sequence[LoopCandidate], scans: Sequence[int]) -> None:
@@ -139,9 +112,9 @@ def _match_row(
     )
 
 
-def _write(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+def _write(path: Path, columns: str, rows: Iterable[Sequence[Any]]) -> None:
     text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows([columns, *rows])
+    csv.writer(text, lineterminator="\n").writerows([columns.split(","), *rows])
     write_text(path, text.getvalue())
 
 
@@ -151,23 +124,23 @@ def timing_text(
     names: list[str],
     seconds: Floats,
     back_end: Mapping[int, Mapping[str, float]] | None = None,
-    saved: Mapping[int, float] | None = None,
+    saved_s: Mapping[int, float] | None = None,
 ) -> str:
     """Table of times of scans by number and stamp, with seconds (N, S) of the stages `names`.
 
     back_end : seconds by row and name, of stages that do not count in the total of a scan
-    saved : seconds by row that were not needed, a column when there are any; empty where nobody knows
+    saved_s : seconds by row that were not needed, a column when there are any; empty where nobody knows
     """
     back_end = back_end or {}
     later = list(dict.fromkeys(f"{AFTER}{name}" for row in back_end.values() for name in row))
-    lines = [",".join(["index", "stamp_ns", *names, "total", *later, *([SAVED] if saved else [])])]
+    lines = [",".join(["index", "stamp_ns", *names, "total", *later, *([SAVED] if saved_s else [])])]
     for k, (index, stamp, row) in enumerate(zip(indices, stamps_ns, seconds, strict=True)):
         own = back_end.get(k, {})
         values = (*row, row.sum(), *(own.get(name.removeprefix(AFTER), 0.0) for name in later))
-        said = [str(index), str(stamp), *(f"{v:.6f}" for v in values)]
-        if saved:
-            said.append(f"{saved[k]:.6f}" if k in saved else "")
-        lines.append(",".join(said))
+        cells = [str(index), str(stamp), *(f"{v:.6f}" for v in values)]
+        if saved_s:
+            cells.append(f"{saved_s[k]:.6f}" if k in saved_s else "")
+        lines.append(",".join(cells))
     return "\n".join(lines) + "\n"
 
 
@@ -188,7 +161,7 @@ def imu_states_text(results: Iterable[ScanResult]) -> str:
 # Bytes per point of the map files: 16 in PLY and PCD, 30 in LAS, with room for the header.
 BYTES_PER_POINT = 32
 # Of a point that the report shows: 12, with room for the map's picture.
-BYTES_PER_POINT_SHOWN = 15
+BYTES_PER_SAMPLE_POINT = 15
 # The 95 scans of sample_data make 310 kB without the map, half of it the report.
 BYTES_PER_SCAN, BYTES_OF_REPORT = 4000, 500_000
 
@@ -243,13 +216,13 @@ def write_scans(folder: RunFolder, record: RunRecord) -> None:
     """
     names, seconds = stage_matrix(record.results)
     indices, stamps = [r.index for r in record.results], [r.stamp_ns for r in record.results]
-    saved = {k: r.imu.saved_s for k, r in enumerate(record.results) if r.imu.saved_s is not None}
-    folder.write_text("timing.csv", timing_text(indices, stamps, names, seconds, record.back_end_seconds, saved))
+    saved_s = {k: r.imu.saved_s for k, r in enumerate(record.results) if r.imu.saved_s is not None}
+    folder.write_text("timing.csv", timing_text(indices, stamps, names, seconds, record.back_end_seconds, saved_s))
     # Every number of scans.csv is the same in every run.
     columns = "index,stamp_ns,status,posed_by,standing,converged,iterations,source_points,inliers,overlap,rmse_m"
-    rows = [columns + ",degenerate,prior_m,prior_deg,prior_norm,steady_norm,steady_iterations,lost,segment,frame"]
-    for r in record.results:
-        values = (
+    columns += ",degenerate,prior_m,prior_deg,prior_norm,steady_norm,steady_iterations,lost,segment,frame"
+    rows = [
+        (
             r.index,
             r.stamp_ns,
             r.status,
@@ -271,8 +244,9 @@ def write_scans(folder: RunFolder, record: RunRecord) -> None:
             r.segment,
             r.frame,
         )
-        rows.append(",".join(str(v) for v in values))
-    folder.write_text("scans.csv", "\n".join(rows) + "\n")
+        for r in record.results
+    ]
+    _write(folder.path / "scans.csv", columns, rows)
     if any(r.imu.state is not None for r in record.results):
         folder.write_text("imu_states.csv", imu_states_text(record.results))
 
@@ -282,9 +256,10 @@ def write_localization(folder: RunFolder, record: RunRecord) -> None:
 
     Also write trajectory.geojson if that map is georeferenced.
     """
-    rows = [
+    columns = (
         "index,stamp_ns,status,doubted,overlap,inlier_share,innovation_m,innovation_deg,sigma_m,sigma_deg,x,y,z,reason"
-    ]
+    )
+    rows: list[Sequence[Any]] = []
     for result, fix in zip(record.results, record.map_fixes, strict=True):
         sigma_m, sigma_rad = (
             np.sqrt(np.linalg.eigvalsh(C)[-1]) for C in (fix.covariance[:3, :3], fix.covariance[3:, 3:])
@@ -304,20 +279,20 @@ def write_localization(folder: RunFolder, record: RunRecord) -> None:
             *(f"{v:.4f}" for v in at),
             fix.reason.replace(",", ";"),
         )
-        rows.append(",".join(str(v) for v in values))
-    folder.write_text("localization.csv", "\n".join(rows) + "\n")
+        rows.append(values)
+    _write(folder.path / "localization.csv", columns, rows)
     if record.georeference is not None:
         map_files.write_geojson(folder.path / "trajectory.geojson", record.trajectory, record.georeference, record.name)
 
 
 def write_map(folder: RunFolder, built: BuiltMap, config: MapConfig, record: RunRecord) -> None:
     """Write map.ply, .pcd, .las or .laz with map.json beside, in map coordinates if the run is georeferenced."""
-    points = len(built.merged) + (0 if built.occupancy is None else len(built.occupancy))
-    columns = sum(kind.itemsize for kind in built.merged.column_types.values())
-    size = BYTES_PER_POINT * points + columns * len(built.merged) + BYTES_PER_POINT_SHOWN * len(built.sample)
+    points = len(built.cloud) + (0 if built.occupancy is None else len(built.occupancy))
+    columns = sum(kind.itemsize for kind in built.cloud.column_types.values())
+    size = BYTES_PER_POINT * points + columns * len(built.cloud) + BYTES_PER_SAMPLE_POINT * len(built.sample)
     folder.require_space(size, "the map")
     path = folder.path / f"map.{config.format}"
-    map_files.write_built(path, built, config, record.name, record.trajectory, record.world, record.georeference)
+    map_files.write_run_map(path, built, config, record.name, record.trajectory, record.world, record.georeference)
 
 
 def write_feature_map(folder: RunFolder, features: FeatureCloud) -> None:

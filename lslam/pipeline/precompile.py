@@ -12,6 +12,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from importlib import import_module
 from typing import TYPE_CHECKING, Protocol
 
 from lslam.core.kernels.cache import is_cold, kernel_folder
@@ -28,15 +29,25 @@ COUNTS = {"icp": 10}
 class Kernels:
     """Kernels of one part of a run.
 
-    is_called : whether a run as configured calls them
+    applies : whether a run as configured calls them
     warm_up : compiles or loads them; ahead : those of them that a second process compiles
     is_of_scans : called before all scans are registered, and then no more; the others are called after that only
     """
 
-    is_called: Callable[[Config], bool]
+    applies: Callable[[Config], bool]
     warm_up: Callable[[Config], object] = lambda config: None
     ahead: Callable[[Config], object] | None = None
     is_of_scans: bool = False
+
+
+def warm_up(*modules: str) -> Callable[[Config], None]:
+    """Function that compiles or loads the kernels of modules of lslam, each by its own `warm_up`."""
+
+    def load(config: Config) -> None:
+        for module in modules:
+            import_module(f"lslam.{module}").warm_up()
+
+    return load
 
 
 def _last_of_method(config: Config) -> None:
@@ -58,50 +69,21 @@ def _loops(config: Config) -> None:
     find_loops.warm_up(config.loops)
 
 
-def _walls(config: Config) -> None:
-    from lslam.osm import wall_match
-
-    wall_match.warm_up()
-
-
-def _map(config: Config) -> None:
-    from lslam.maps import crispness, merge
-
-    merge.warm_up()
-    crispness.warm_up()
-
-
-def _colours(config: Config) -> None:
-    from lslam.maps import colour
-
-    colour.warm_up()
-
-
-def _imu(config: Config) -> None:
-    from lslam.odometry.frontend import inertial_start
-
-    inertial_start.warm_up()
-
-
-def _wheels(config: Config) -> None:
-    from lslam.odometry.inertial import wheel_motion
-
-    wheel_motion.warm_up()
-
-
+_map = warm_up("maps.merge", "maps.crispness")
+_imu, _wheels = warm_up("odometry.frontend.inertial_start"), warm_up("odometry.inertial.wheel_motion")
 KERNELS = {
     # A method has a `warm_up` of its own.
     "method": Kernels(lambda config: True, ahead=_last_of_method, is_of_scans=True),
     "imu": Kernels(lambda config: config.imu.use, _imu, is_of_scans=True),
     "wheels": Kernels(lambda config: bool(config.wheels.source), _wheels, is_of_scans=True),
     "loops": Kernels(lambda config: config.loops.use or bool(config.localize.map), _loops, _loops),
-    "walls": Kernels(lambda config: bool(config.osm.extract), _walls),
+    "walls": Kernels(lambda config: bool(config.osm.extract), warm_up("osm.wall_match")),
     "map": Kernels(lambda config: config.map.write, _map, _map),
-    "colours": Kernels(lambda config: config.map.write and config.map.colour, _colours),
+    "colours": Kernels(lambda config: config.map.write and config.map.colour, warm_up("maps.colour")),
 }
 
 
-class Warmed(Protocol):
+class HasKernels(Protocol):
     """Object with kernels of its own."""
 
     def warm_up(self) -> None:
@@ -109,7 +91,7 @@ class Warmed(Protocol):
         ...
 
 
-def load_kernels(config: Config, trackers: Iterable[Warmed]) -> None:
+def load_kernels(config: Config, trackers: Iterable[HasKernels]) -> None:
     """Compile or load the kernels that registering scans calls; trackers : those that do it."""
     for tracker in trackers:
         tracker.warm_up()
@@ -119,7 +101,7 @@ def load_kernels(config: Config, trackers: Iterable[Warmed]) -> None:
 def load_parts(config: Config, names: Iterable[str]) -> None:
     """Compile or load the kernels of these parts, as far as a run as configured calls them."""
     for name in names:
-        if KERNELS[name].is_called(config):
+        if KERNELS[name].applies(config):
             KERNELS[name].warm_up(config)
 
 
@@ -139,7 +121,7 @@ def start_helper(config: Config, *, if_cold: bool = False) -> None:
         or (if_cold and not is_cold())
     ):
         return
-    words = [name for name, part in KERNELS.items() if part.ahead and part.is_called(config)]
+    words = [name for name, part in KERNELS.items() if part.ahead and part.applies(config)]
     command = [sys.executable, "-P", "-m", "lslam.pipeline.precompile", config.model_dump_json(), *words]
     nowhere = subprocess.DEVNULL
     with contextlib.suppress(OSError):  # the first process compiles everything then
@@ -147,7 +129,7 @@ def start_helper(config: Config, *, if_cold: bool = False) -> None:
 
 
 @contextlib.contextmanager
-def helped() -> Iterator[None]:
+def helper_process() -> Iterator[None]:
     """Context at whose end the second process, if one was started, ends."""
     try:
         yield

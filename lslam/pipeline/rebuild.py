@@ -6,7 +6,7 @@ import csv
 import logging
 import os
 import tempfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,7 +25,6 @@ from lslam.core.errors import (
     output_errors,
 )
 from lslam.core.types.arrays import Floats
-from lslam.core.types.cloud import ArrayCloud
 from lslam.core.types.gnss import Georeference, OutputCrs
 from lslam.core.types.run_record import Crispness, RunRecord
 from lslam.core.types.scan_result import ScanResult, Status
@@ -33,7 +32,7 @@ from lslam.core.types.sequence import Sequence, select
 from lslam.core.types.trajectory import Trajectory
 from lslam.core.untrusted import MISFIT, parse_json
 from lslam.io.formats.atomic import write_text
-from lslam.io.formats.point_files import MAP_SUFFIXES, read_cloud
+from lslam.io.formats.point_files import MAP_SUFFIXES
 from lslam.io.formats.state_files import read_npz
 from lslam.io.formats.trajectory_files import read_trajectory
 from lslam.io.readers import open_sequence
@@ -43,31 +42,30 @@ from lslam.maps.colour import ColourCounts
 from lslam.maps.crispness import crispness
 from lslam.maps.georeference import in_crs
 from lslam.maps.mesh import require_open3d
-from lslam.pipeline.colour_pass import build_finished_map
-from lslam.pipeline.map_attributes import KEY, needs_labels
+from lslam.pipeline.further_passes import build_finished_map
 from lslam.pipeline.map_files import (
+    BuiltMap,
     drop_note,
     georeference_of,
-    in_own_world,
     is_note,
     note_of,
     note_with,
     noted_last,
     read_json,
-    write_built,
     write_json,
+    write_run_map,
 )
-from lslam.pipeline.map_pass import INTERRUPTED, BuiltMap
-from lslam.pipeline.run_folder import MANIFEST, SPOOL, held, require_run
+from lslam.pipeline.map_pass import INTERRUPTED, KEY, needs_labels
+from lslam.pipeline.run_folder import MANIFEST, SPOOL, lock_folder, require_new, require_run
+from lslam.pipeline.watch import SILENT, Watch
 from lslam.registration.preprocessing.sweep_clock import SweepClock
 from lslam.registration.preprocessing.views import ClockView, WithoutClasses
 from lslam.reports.evaluations import run_document
-from lslam.reports.figures import PlottedRun
 from lslam.reports.html import with_new_map
 
 log = logging.getLogger("lslam")
 EVALUATION, REPORT = "evaluation.json", "report.html"
-_KEPT = "%s keeps the figures of the map before: it %s"
+_STALE = "%s keeps the figures of the map before: it %s"
 
 
 @dataclass(frozen=True)
@@ -80,6 +78,11 @@ class EarlierRun:
     trajectory: Trajectory
     statuses: tuple[Status, ...]
     georeference: Georeference | None
+
+    @property
+    def name(self) -> str:
+        """Name of its sequence."""
+        return str(self.manifest.get("sequence", {}).get("name", self.folder.name))
 
     @property
     def sequence_path(self) -> str:
@@ -133,14 +136,14 @@ def read_run(folder: Path, settings: Iterable[str] = ()) -> EarlierRun:
     return EarlierRun(folder, manifest, config, trajectory, statuses, georeference_of(manifest.get("georeference")))
 
 
-def is_gone(run: EarlierRun) -> bool:
+def is_missing(run: EarlierRun) -> bool:
     """Whether the recording is missing at its old path."""
     return not as_path(run.sequence_path).exists()
 
 
 def recording_of(run: EarlierRun, sequence: Path | None = None, flag: str = "--sequence") -> Path:
     """Path of the run's recording, or its new place. Raises InputError naming the `flag` when it is missing."""
-    if sequence is None and is_gone(run):
+    if sequence is None and is_missing(run):
         raise InputError(
             f"the raw scans of {run.folder} are gone: {run.sequence_path} does not exist; say where they are with {flag}"
         )
@@ -156,37 +159,39 @@ def open_scans(run: EarlierRun, sequence: Path | None = None, *, flag: str = "--
     """
     path = recording_of(run, sequence, flag)
     section = run.config.input
-    known = run.topics if sequence is None else {}
-    given = {name: value for name, value in reading.items() if value is not None}
-    opened = open_sequence(path, vertical_correction_deg=section.vertical_correction_deg, **(known | given))
-    dropped = run.config.preprocess.drop_labels
-    if dropped or needs_labels(run.config.map):
-        opened = with_labels(opened, "preprocess.drop_labels" if dropped else KEY)
-    opened = _with_clock(run, opened)
-    opened = WithoutClasses(opened, dropped) if dropped else opened
-    chosen = select(opened, section.start, section.count, section.skip_frames)
+    options: dict[str, Any] = run.topics if sequence is None else {}
+    options |= {name: value for name, value in reading.items() if value is not None}
+    recording = open_sequence(path, vertical_correction_deg=section.vertical_correction_deg, **options)
+    labels = run.config.preprocess.drop_labels
+    if labels or needs_labels(run.config.map):
+        recording = with_labels(recording, "preprocess.drop_labels" if labels else KEY)
+    recording = _with_clock(run, recording)
+    recording = WithoutClasses(recording, labels) if labels else recording
+    scans = select(recording, section.start, section.count, section.skip_frames)
     count = len(run.trajectory)
-    if len(chosen) < count or np.any(np.abs(chosen.stamps_ns[:count] - run.trajectory.stamps_ns) > 1000):
+    if len(scans) < count or np.any(np.abs(scans.stamps_ns[:count] - run.trajectory.stamps_ns) > 1000):
         raise InputError(
-            f"{path} does not fit {run.folder}: its {len(chosen)} scans have other stamps than the {count} poses"
+            f"{path} does not fit {run.folder}: its {len(scans)} scans have other stamps than the {count} poses"
         )
-    return chosen
+    return scans
 
 
-def _with_clock(run: EarlierRun, opened: Sequence) -> Sequence:
+def _with_clock(run: EarlierRun, recording: Sequence) -> Sequence:
     """Recording with the rule for its points' times as the run decided."""
     facts = run.manifest.get("sequence", {}).get("point_times")
     if facts is None:
-        return opened
+        return recording
     try:
         clock, *later = (
             None if part["clock"] is None else SweepClock(**part["clock"]) for part in (facts, *facts.get("later", ()))
         )
         firsts = [int(part["scan"]) for part in facts.get("later", ())]
-        is_stated = facts["verdict"] == "stated"
+        has_verdict = facts["verdict"] == "stated"
     except MISFIT as error:
         raise InputError(f"{run.folder / MANIFEST}: point_times: {error}; run the sequence again") from None
-    return opened if clock is None and not is_stated else ClockView(opened, clock, zip(firsts, later, strict=True))
+    return (
+        recording if clock is None and not has_verdict else ClockView(recording, clock, zip(firsts, later, strict=True))
+    )
 
 
 def rebuild(
@@ -196,8 +201,7 @@ def rebuild(
     *,
     overwrite: bool = False,
     crs: OutputCrs | None = None,
-    on_step: Callable[[], None] = lambda: None,
-    should_stop: Callable[[], bool] = lambda: False,
+    watch: Watch = SILENT,
 ) -> RebuiltMap:
     """Build the map with the run's configuration and write it to `out`, by default map.<format> in the run folder.
 
@@ -206,8 +210,8 @@ def rebuild(
     nothing changes before everything is whole.
 
     Raises OutputExistsError when the file is there, or a run is at work in the folder, OutputError when it cannot be written,
-    UsageError for a `crs` without a georeference or that no map can be written in, InterruptedRunError when `should_stop`
-    said so.
+    UsageError for a `crs` without a georeference or that no map can be written in, InterruptedRunError when `watch`
+    says so.
     """
     path = run.folder / f"map.{run.config.map.format}" if out is None else out
     check_output(path, overwrite)
@@ -215,20 +219,20 @@ def rebuild(
         require_open3d()
     georeference = place_of(run, crs)
     is_own = path.stem == "map" and path.resolve().parent == run.folder.resolve()
-    with held(run.folder) if is_own else nullcontext():
-        built = build_finished_map(sequence, results_of(run), run.config, on_step, should_stop, path.parent)
-        if should_stop():
+    with lock_folder(run.folder) if is_own else nullcontext():
+        built = build_finished_map(sequence, results_of(run), run.config, watch, path.parent)
+        if watch.should_stop():
             raise InterruptedRunError(INTERRUPTED)
-        score = crispness(built.merged) if run.config.map.voxel else None
+        score = crispness(built.cloud) if run.config.map.voxel else None
         with _stage(path.parent) as stage:
-            write_built(
+            write_run_map(
                 stage / path.name, built, run.config.map, sequence.name, run.trajectory, run.world, georeference
             )
             if is_own:
-                write_renewed(stage, run.folder, _record(run, built, path.name, score))
+                renew_files(stage, run.folder, _record(run, built, path.name, score))
             _publish(stage, path)
-    log.info("%d points in %s", len(built.merged), path)
-    return RebuiltMap(path, len(built.merged), sum(s == "ok" for s in run.statuses), score, built.colour)
+    log.info("%d points in %s", len(built.cloud), path)
+    return RebuiltMap(path, len(built.cloud), sum(s == "ok" for s in run.statuses), score, built.colour)
 
 
 def check_output(path: Path, overwrite: bool) -> None:
@@ -237,8 +241,7 @@ def check_output(path: Path, overwrite: bool) -> None:
         raise UsageError(f"{path}: no map file lslam writes; known suffixes: {', '.join(MAP_SUFFIXES)}")
     if not path.parent.is_dir():
         raise OutputError(f"{path} cannot be written: the folder {path.parent} does not exist")
-    if path.exists() and not overwrite:
-        raise OutputExistsError(f"{path} exists; name another file with --out or replace it with --overwrite")
+    require_new(path, overwrite)
     beside = path.with_suffix(".json")
     if not is_note(beside):
         raise OutputExistsError(f"{beside}, where the note of {path.name} goes, is something else: name another --out")
@@ -257,8 +260,8 @@ def place_of(run: EarlierRun, crs: OutputCrs | None) -> Georeference | None:
 
 def _record(run: EarlierRun, built: BuiltMap, name: str, score: Crispness | None) -> RunRecord:
     """Record for the run's report about its map, and the manifest with the new map."""
-    points, section = len(built.merged), run.config.map
-    about = {"file": name, "points": points, "voxel": section.voxel, "done": list(built.done)}
+    points = len(built.cloud)
+    about = {"file": name, "points": points, "voxel": run.config.map.voxel, "done": list(built.steps)}
     manifest = {**run.manifest, "map_points": points, "map": about}
     return RunRecord(
         name="",
@@ -315,20 +318,20 @@ def covariances_of(run: EarlierRun) -> Floats | None:
     Raises InputError when the file is damaged.
     """
     path = run.folder / "covariances.npz"
-    known = read_npz(path).get("covariances") if path.is_file() else None
-    if known is None or known.shape != (len(run.trajectory), 6, 6):
+    C = read_npz(path).get("covariances") if path.is_file() else None
+    if C is None or C.shape != (len(run.trajectory), 6, 6):
         return None
-    return np.where(np.isfinite(known).all((1, 2), keepdims=True), known, np.nan)
+    return np.where(np.isfinite(C).all((1, 2), keepdims=True), C, np.nan)
 
 
 def map_of(target: Path) -> Path:
     """Map file, or the one written last in a run folder. Raises InputError when there is none."""
     if not target.is_dir():
         return target
-    found = [target / f"map{suffix}" for suffix in MAP_SUFFIXES if (target / f"map{suffix}").is_file()]
-    if not found:
+    maps = [target / f"map{suffix}" for suffix in MAP_SUFFIXES if (target / f"map{suffix}").is_file()]
+    if not maps:
         raise InputError(f"{target} has no map file; build one with: lslam map {target}")
-    return noted_last(found[0]) or found[0]
+    return noted_last(maps[0]) or maps[0]
 
 
 def _statuses(path: Path, count: int) -> tuple[Status, ...]:
@@ -352,49 +355,26 @@ def _statuses(path: Path, count: int) -> tuple[Status, ...]:
     return tuple(known[word] for word in words)
 
 
-def write_renewed(target: Path, folder: Path, record: RunRecord) -> None:
+def renew_files(target: Path, folder: Path, record: RunRecord) -> None:
     """Write into `target` the files of the run folder `folder`, with the parts about its map renewed.
 
     record : of the new map, what is drawn with it, and the manifest as it shall be. A report that the run did not write is
         not made; what cannot be read is left alone, which is said. Raises OutputError.
     """
-    known, new = read_json(folder / EVALUATION), run_document(record, None) or {}
-    if known or not (folder / EVALUATION).exists():
-        known.pop("map", None)
-        if document := {**new, **known}:
+    before, new = read_json(folder / EVALUATION), run_document(record, None) or {}
+    if before or not (folder / EVALUATION).exists():
+        before.pop("map", None)
+        if document := {**new, **before}:
             write_json(target / EVALUATION, document)
     else:
-        log.warning(_KEPT, folder / EVALUATION, "cannot be read")
+        log.warning(_STALE, folder / EVALUATION, "cannot be read")
     try:
         page = with_new_map((folder / REPORT).read_text(encoding="utf-8"), record)
         write_text(target / REPORT, page)
     except FileNotFoundError:
         pass
     except OSError as error:
-        log.warning(_KEPT, folder / REPORT, f"cannot be read ({error})")
+        log.warning(_STALE, folder / REPORT, f"cannot be read ({error})")
     except ValueError:
-        log.warning(_KEPT, folder / REPORT, "was not written by this version of lslam: run the sequence again")
+        log.warning(_STALE, folder / REPORT, "was not written by this version of lslam: run the sequence again")
     write_json(target / MANIFEST, record.manifest)
-
-
-def viewed_run(folder: Path) -> PlottedRun:
-    """Trajectory, odometry if there was a back end, and map, all in the run's world.
-
-    Raises InputError naming what is missing or broken; a run without a map is shown without one.
-    """
-    run = read_run(folder)
-    odometry = None
-    if (folder / "trajectory_odometry.tum").is_file():
-        odometry = read_trajectory(folder / "trajectory_odometry.tum", "tum")
-    name = str(run.manifest.get("sequence", {}).get("name", folder.name))
-    return PlottedRun(f"{name} ({folder.name})", run.trajectory, odometry, cloud=_cloud(folder))
-
-
-def _cloud(folder: Path) -> ArrayCloud | None:
-    """Map of the run; LAS of a georeferenced run is transformed back to its world."""
-    try:
-        path = map_of(folder)
-    except InputError as error:
-        log.warning("%s", error)
-        return None
-    return in_own_world(path, read_cloud(path))[0]

@@ -1,4 +1,4 @@
-"""Reuse of an earlier run: continuing in its folder, or taking its odometry for a new pose graph."""
+"""Going on with a run that was killed or interrupted: what it shares with its resumption, as digests."""
 
 from __future__ import annotations
 
@@ -13,14 +13,12 @@ import numpy as np
 
 from lslam.core import __version__
 from lslam.core.config import Config
-from lslam.core.config.config import load_config
 from lslam.core.errors import (
     GateError,
     InputError,
     OutputExistsError,
     RunFailedError,
     RunFinishedError,
-    UsageError,
     cause,
 )
 from lslam.core.printable import first_of, printable_tree
@@ -28,12 +26,10 @@ from lslam.core.types.imu import WheelStream
 from lslam.core.types.sequence import Sequence
 from lslam.core.types.trajectory import Trajectory
 from lslam.core.untrusted import MISFIT, parse_json, parse_toml
-from lslam.io.readers import open_sequence
 from lslam.io.remote import RemotePath
 from lslam.osm.source import extract_digest
 from lslam.pipeline.job import is_open
-from lslam.pipeline.rebuild import EarlierRun, read_run, recording_of
-from lslam.pipeline.run_folder import MANIFEST, require_odometry
+from lslam.pipeline.run_folder import MANIFEST
 
 # Keys that change no byte of the result, or only which of its metrics are shown.
 FREE = ("input.threads", "odometry.checkpoint_s", "keyframes.deflate", "eval.metrics")
@@ -48,8 +44,6 @@ INPUTS = {
     "poses": "the poses of --poses are others",
     "manual": "the pairs of --loops-file or the points of --control are others",
 }
-# Sections that odometry does not look at.
-FREE_SECTIONS = ("loops", "graph", "gnss", "osm", "map", "eval", "report")
 
 
 def input_digest(sequence: Sequence, truth: Trajectory | None) -> str:
@@ -102,11 +96,11 @@ def job_digest(config: Config, of_input: str, of_imu: str = "") -> str:
 
     Which metrics are shown makes no other run.
     """
-    known = config.model_dump(mode="json", exclude={"eval": {"metrics"}})
-    said: dict[str, Any] = {"config": known, "input": of_input, "lslam": __version__}
+    tree = config.model_dump(mode="json", exclude={"eval": {"metrics"}})
+    content: dict[str, Any] = {"config": tree, "input": of_input, "lslam": __version__}
     if config.imu.use:
-        said["imu"] = of_imu
-    return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
+        content["imu"] = of_imu
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def _files(path: Path) -> Iterator[tuple[str, os.stat_result]]:
@@ -131,12 +125,12 @@ def run_identity(
     sequence: Sequence,
     truth: Trajectory | None,
     config: Config,
-    given: Trajectory | None = None,
+    poses: Trajectory | None = None,
     wheels: WheelStream | None = None,
 ) -> dict[str, str]:
     """Facts that a run and its resumption must share beside the configuration; for manifest.json.
 
-    given : the poses of --poses; wheels : the readings of --wheels
+    poses : of --poses; wheels : the readings of --wheels
 
     Raises InputError when the recording cannot be listed.
     """
@@ -154,7 +148,7 @@ def run_identity(
         "wheels": "" if wheels is None else _digest(vars(wheels).values()),
         "gnss": _digest(() if gnss is None else vars(gnss).values()),
         "osm": extract_digest(config.osm),
-        "poses": _digest(() if given is None else (given.stamps_ns, given.poses)),
+        "poses": _digest(() if poses is None else (poses.stamps_ns, poses.poses)),
         "manual": _content(config.loops.file, config.graph.control),
     }
 
@@ -162,10 +156,10 @@ def run_identity(
 def _content(*paths: str) -> str:
     """Digest of the content of files; empty without any."""
     try:
-        known = [Path(path).read_bytes() for path in paths if path]
+        contents = [Path(path).read_bytes() for path in paths if path]
     except OSError as error:
         raise InputError(f"{error.filename} cannot be read: {cause(error)}") from None
-    return hashlib.sha256(b"\0".join(known)).hexdigest() if known else ""
+    return hashlib.sha256(b"\0".join(contents)).hexdigest() if contents else ""
 
 
 def _digest(values: Iterable[Any]) -> str:
@@ -190,26 +184,26 @@ def may_go_on(folder: Path, identity: dict[str, str], config: Config) -> bool:
         return False
     try:
         manifest = parse_json((folder / MANIFEST).read_text(encoding="utf-8"))
-        begun = parse_toml((folder / "config.toml").read_text(encoding="utf-8"))
-        status, version, known = str(manifest["status"]), str(manifest["lslam"]), dict(manifest["identity"])
+        before = parse_toml((folder / "config.toml").read_text(encoding="utf-8"))
+        status, version, inputs = str(manifest["status"]), str(manifest["lslam"]), dict(manifest["identity"])
     except (OSError, *MISFIT) as error:
         raise OutputExistsError(
             f"the run in {folder} does not say what it was ({type(error).__name__}: {error}): --overwrite replaces it"
         ) from None
-    why = _difference(known, version, begun, identity, config)
+    why = _difference(inputs, version, before, identity, config)
     if why:
         raise OutputExistsError(f"the run in {folder} cannot go on: {why}; --overwrite runs it anew")
-    _refuse_finished(folder, status, manifest, config)
+    _raise_outcome(folder, status, manifest, config)
     return True
 
 
 def _difference(
-    known: dict[str, Any], version: str, begun: dict[str, Any], identity: dict[str, str], config: Config
+    inputs: dict[str, Any], version: str, tree: dict[str, Any], identity: dict[str, str], config: Config
 ) -> str:
     """Differences between the earlier run and this one, in words; empty when there are none."""
     if version != __version__:
         return f"it was begun by lslam {version}, this is {__version__}"
-    before, now = (_flat(tree) for tree in (begun, printable_tree(config.model_dump(mode="json"))))
+    before, now = map(_flat, (tree, printable_tree(config.model_dump(mode="json"))))
     # What the scene decided of an open key is taken from the run that was begun.
     differing = [key for key in sorted(before | now) if before.get(key) != now.get(key)]
     changed = [key for key in differing if key not in FREE and not is_open(config, key)]
@@ -217,22 +211,22 @@ def _difference(
     if changed and set(changed) <= unknown:
         return f"it was begun by an earlier lslam, which had no {first_of(changed)}"
     if changed:
-        said = [f"{key} was {before.get(key)!r} and is {now.get(key)!r}" for key in changed[:3]]
-        return f"the configuration differs: {', '.join(said)}{', ...' if len(changed) > 3 else ''}"
-    return "; ".join(text for name, text in INPUTS.items() if known.get(name, "") != identity[name])
+        values = [f"{key} was {before.get(key)!r} and is {now.get(key)!r}" for key in changed[:3]]
+        return f"the configuration differs: {', '.join(values)}{', ...' if len(changed) > 3 else ''}"
+    return "; ".join(text for name, text in INPUTS.items() if inputs.get(name, "") != identity[name])
 
 
-def _refuse_finished(folder: Path, status: str, manifest: dict[str, Any], config: Config) -> None:
+def _raise_outcome(folder: Path, status: str, manifest: dict[str, Any], config: Config) -> None:
     """Raise the outcome of a finished run."""
-    said = manifest.get("problems")
-    why = "; ".join(str(problem) for problem in said) if isinstance(said, list) else ""
-    said = f"the run in {folder} is finished"
+    problems = manifest.get("problems")
+    why = "; ".join(map(str, problems)) if isinstance(problems, list) else ""
+    state = f"the run in {folder} is finished"
     if status == "diverged":
-        raise RunFailedError(f"{said}, it diverged: {why}; --overwrite runs it anew")
+        raise RunFailedError(f"{state}, it diverged: {why}; --overwrite runs it anew")
     if status == "degraded" and config.input.strict:
-        raise GateError(f"--strict: {said} and degraded: {why}")
+        raise GateError(f"--strict: {state} and degraded: {why}")
     if status in ("done", "degraded"):
-        raise RunFinishedError(f"{said} ({status}): nothing is left to do")
+        raise RunFinishedError(f"{state} ({status}): nothing is left to do")
 
 
 def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -244,55 +238,3 @@ def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
         elif value is not None:
             flat[prefix + key] = value
     return flat
-
-
-def open_again(run: EarlierRun, sequence: Path | None = None, **reading: Any) -> Sequence:
-    """Recording of the run, with the streams that its configuration needs; `reading` overrides the run's options.
-
-    Raises InputError when it is gone.
-    """
-    config = run.config
-    return open_sequence(
-        recording_of(run, sequence),
-        vertical_correction_deg=config.input.vertical_correction_deg,
-        imu=config.imu.use,
-        gnss=config.gnss.mode != "off",
-        **reading_of(run, sequence, **reading),
-    )
-
-
-def reading_of(run: EarlierRun, sequence: Path | None = None, **reading: Any) -> dict[str, Any]:
-    """Options of `open_sequence` for the recording of the run, or for its new place."""
-    told = run.manifest.get("sequence", {}).get("reading", {}) if sequence is None else {}
-    return told | {name: value for name, value in reading.items() if value is not None}
-
-
-def require_another(run: Path, out: Path) -> None:
-    """Raise UsageError when both paths are one folder."""
-    if out.resolve() == run.resolve():
-        raise UsageError(f"--out {out}: the run itself stays as it is, name another folder")
-
-
-def _require_same_odometry(run: EarlierRun) -> None:
-    before = load_config(run.folder / "config.toml", environ={})
-    for section in Config.model_fields:
-        known, now = getattr(before, section), getattr(run.config, section)
-        changed = [key for key in type(known).model_fields if getattr(known, key) != getattr(now, key)]
-        if section not in FREE_SECTIONS and changed:
-            raise UsageError(
-                f"{section}.{changed[0]} is of the odometry, which is not run again: lslam graph takes "
-                f"keys of {', '.join(FREE_SECTIONS)}"
-            )
-
-
-def read_for_graph(folder: Path, settings: list[str]) -> EarlierRun:
-    """As `read_run`, for `pipeline.run` to take as `earlier`.
-
-    Raises InputError for a run that kept no odometry, or was located in a map, UsageError for settings of odometry.
-    """
-    run = read_run(folder, settings)
-    require_odometry(folder)
-    if run.config.localize.map:
-        raise InputError(f"{folder} was located in a map, which takes the place of a pose graph")
-    _require_same_odometry(run)
-    return run

@@ -19,7 +19,7 @@ from lslam.core.types.warned import collect_warnings
 from lslam.io.remote import as_path
 from lslam.pipeline.job import announce, prepare
 from lslam.pipeline.odometry_pass import estimate_poses
-from lslam.pipeline.precompile import helped, start_helper
+from lslam.pipeline.precompile import helper_process, start_helper
 from lslam.pipeline.stages import finalise_poses, in_folder, raise_outcome, score, write_results
 from lslam.pipeline.watch import RunOutcome, Watch
 
@@ -63,7 +63,7 @@ def run(
     """
     watch = watch or Watch()
     config = config or Config()
-    with collect_warnings() as heard, helped(), jit.announce_compiling(log, partial(start_helper, config)):
+    with collect_warnings() as warnings, helper_process(), jit.announce_compiling(log, partial(start_helper, config)):
         watch.on_start("preparing", 0)
         job = prepare(sequence, config, ground_truth, command, watch)
         if earlier is not None and not np.array_equal(job.sequence.stamps_ns, earlier.trajectory.stamps_ns):
@@ -71,14 +71,14 @@ def run(
             raise InputError(f"{job.sequence.path} does not fit {earlier.folder}: its {count} scans have other stamps")
         if ground_truth is not None and Path(ground_truth.source).is_file():
             job.manifest.truth_file = str(Path(ground_truth.source).absolute())
-        job.manifest.reading, job.manifest.warnings = dict(reading or {}), heard
+        job.manifest.reading, job.manifest.warnings = dict(reading or {}), warnings
         with in_folder(job, None if out is None else as_path(out), overwrite, resume, earlier) as job:
             announce(job)
             record = estimate_poses(job)
-            done = finalise_poses(job, record)
+            back_end = finalise_poses(job, record)
             watch.on_start("results", 0)
             evaluation = score(record, job.sequence, job.config)
-            write_results(job, record, done, evaluation)
+            write_results(job, record, back_end, evaluation)
     outcome = RunOutcome(record, evaluation)
     watch.on_end(outcome)
     raise_outcome(job.manifest, job.config, "" if out is None else ", and --resume goes on")

@@ -33,40 +33,15 @@ ODOMETRY, IMU_START = "odometry.npz", "imu.npz"
 REPLIES = "osm_replies"
 SPOOL = ".lslam-map-"  # what a map in the making is called, as its merger does
 # What a run that goes on needs of what the one before left.
-_NEEDED = (MANIFEST, "config.toml", LOG)
+_FOR_RESUMING = (MANIFEST, "config.toml", LOG)
 OURS = (
-    MANIFEST,
-    "config.toml",
-    LOG,
-    "trajectory.tum",
-    "trajectory_kitti.txt",
-    "covariances.npz",
-    "map.ply",
-    "map.pcd",
-    "map.las",
-    "map.laz",
-    "map.json",
-    "map_mesh.ply",
-    "feature_map.ply",
-    "trajectory.geojson",
-    "occupancy.npz",
-    "occupancy.ply",
-    "floor_plan.png",
-    "floor_plan.yaml",
-    "evaluation.json",
-    "trajectory_odometry.tum",
-    "loops.csv",
-    "control.csv",
-    "graph.g2o",
-    "osm_matches.csv",
-    "buildings.geojson",
-    "buildings.osm",
-    "timing.csv",
-    "scans.csv",
-    "imu_states.csv",
-    "localization.csv",
-    "sessions.csv",
-    "report.html",
+    *(MANIFEST, "config.toml", LOG),
+    *("trajectory.tum", "trajectory_kitti.txt", "covariances.npz"),
+    *("map.ply", "map.pcd", "map.las", "map.laz", "map.json", "map_mesh.ply", "feature_map.ply", "trajectory.geojson"),
+    *("occupancy.npz", "occupancy.ply", "floor_plan.png", "floor_plan.yaml"),
+    *("evaluation.json", "trajectory_odometry.tum", "loops.csv", "control.csv", "graph.g2o"),
+    *("osm_matches.csv", "buildings.geojson", "buildings.osm"),
+    *("timing.csv", "scans.csv", "imu_states.csv", "localization.csv", "sessions.csv", "report.html"),
 )
 UPLOADED_FROM = "spool"
 
@@ -88,7 +63,7 @@ class RunFolder:
             _require_free(path, overwrite or goes_on)
             path.mkdir(parents=True, exist_ok=True)
             self._lock = _hold(path)
-            self._clear(_NEEDED if goes_on else ())
+            self._clear(_FOR_RESUMING if goes_on else ())
         except OSError as error:
             self._let_go()
             raise OutputError(f"output folder {path} cannot be written: {cause(error)}") from None
@@ -112,12 +87,19 @@ class RunFolder:
     def require_space(self, size: int, what: str) -> None:
         """Raise OutputError when the disk has less than `size` bytes left for `what`."""
         with output_errors(f"output folder {self.path}"):
-            left = shutil.disk_usage(self.path).free
-        if left < size:
+            free = shutil.disk_usage(self.path).free
+        if free < size:
             raise OutputError(
-                f"the disk of {self.path} has {left / 1e6:.1f} MB left, {what} needs about {size / 1e6:.1f} MB; "
+                f"the disk of {self.path} has {free / 1e6:.1f} MB left, {what} needs about {size / 1e6:.1f} MB; "
                 "free some space or name another folder with --out"
             )
+
+    def write_failure(self, manifest: dict[str, Any]) -> None:
+        """Write the manifest of a run that failed; a full disk at this point must not hide the first error."""
+        try:
+            self.write_manifest(manifest)
+        except OutputError as error:
+            log.error("%s", error)
 
     def drop_checkpoint(self) -> None:
         """Delete the checkpoint of a finished run."""
@@ -128,9 +110,9 @@ class RunFolder:
 
         The checkpoints stay too, until `drop_checkpoint`: nothing is lost in between.
         """
-        kept = [*sorted((self.path / CHECKPOINT).glob("odometry-*.npz"))[-1:], self.path / CHECKPOINT / IMU_START]
+        files = [*sorted((self.path / CHECKPOINT).glob("odometry-*.npz"))[-1:], self.path / CHECKPOINT / IMU_START]
         if (self.path / KEYFRAMES).is_dir():
-            for file in kept:
+            for file in files:
                 name = IMU_START if file.name == IMU_START else ODOMETRY
                 with contextlib.suppress(FileNotFoundError):
                     _share(file, self.path / KEYFRAMES / name)
@@ -179,15 +161,15 @@ class RunFolder:
             self._lock.close()
             self._lock = None
 
-    def _clear(self, needed: Collection[str] = ()) -> None:
-        """Remove an earlier run's files and nothing else, except those `needed` and those kept for resuming."""
+    def _clear(self, others: Collection[str] = ()) -> None:
+        """Remove an earlier run's files and nothing else, except the `others`; with others, what resuming needs stays too."""
         for name in OURS:
-            if name in needed:
+            if name in others:
                 continue
             (self.path / name).unlink(missing_ok=True)
             (self.path / f"{name}.part").unlink(missing_ok=True)
         _clear_spools(self.path)  # of a run that was killed
-        if not needed:
+        if not others:
             _clear_own(self.path / KEYFRAMES, "*.npz")
             _clear_own(self.path / REPLIES, "*.json")
             _clear_own(self.path / SESSIONS, "*.tum")
@@ -247,6 +229,12 @@ def check_target(path: Path, overwrite: bool) -> None:
         _require_free(path, overwrite)
 
 
+def require_new(path: Path, overwrite: bool, flag: str = "--out") -> None:
+    """Raise OutputExistsError for a file that is there and may not be replaced; flag : by which another one is named."""
+    if path.exists() and not overwrite:
+        raise OutputExistsError(f"{path} exists; name another file with {flag} or replace it with --overwrite")
+
+
 def require_run(path: Path) -> None:
     """Raise InputError unless `path` is the folder of a run."""
     if not path.is_dir():
@@ -275,7 +263,7 @@ def _require_free(path: Path, overwrite: bool) -> None:
         raise OutputExistsError(f"output {path} is a file; name a folder with --out")
     if not any(path.iterdir()):
         return
-    if _is_held(path):
+    if _is_in_use(path):
         raise _in_use(path)
     if not overwrite:
         raise OutputExistsError(
@@ -290,7 +278,7 @@ def _in_use(path: Path) -> OutputExistsError:
     return OutputExistsError(f"output folder {path} is in use by another run; name another with --out")
 
 
-def _is_held(path: Path) -> bool:
+def _is_in_use(path: Path) -> bool:
     try:
         with (path / LOCK).open("r") as stream:
             return not lock(stream)
@@ -312,7 +300,7 @@ def _hold(path: Path) -> IO[str]:
 
 
 @contextlib.contextmanager
-def held(path: Path) -> Iterator[None]:
+def lock_folder(path: Path) -> Iterator[None]:
     """Lock a finished run's folder for changes. Raises OutputExistsError while another process works in it.
 
     Remains of a killed process are removed. Raises OutputError where nothing can be written.
@@ -345,8 +333,12 @@ def default_folder(sequence: str, method: str, now: float | None = None) -> Path
     return folder
 
 
-def spool_of(place: RemotePath) -> Path:
-    """Local folder in which the run for `place` is made, the same for every attempt. Raises OutputError."""
+def spool_of(place: Path) -> Path:
+    """Folder on this machine in which the run for `place` is made, the same for every attempt: `place` itself, or for one
+    in storage a folder in the cache. Raises OutputError.
+    """
+    if not isinstance(place, RemotePath):
+        return place
     folder = cache_folder(UPLOADED_FROM)
     if folder is None:
         raise OutputError(f"{place} needs a folder to be filled in: name a folder of your own in XDG_CACHE_HOME")

@@ -1,4 +1,4 @@
-"""Segments of a run as sessions: each is placed relative to earlier ones by place recognition, into one frame."""
+"""Scans that are lost: segments of a run, placed as sessions into one frame by place recognition, and alerts of the monitor."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ from lslam.backend.loops.detector import LEAST_REACH
 from lslam.backend.loops.verify import is_elsewhere
 from lslam.core.config import Config
 from lslam.core.geometry import noise, se3
-from lslam.core.types.arrays import Floats
-from lslam.core.types.scan_result import MotionCheck, ScanResult
-from lslam.core.types.trajectory import Segment
+from lslam.core.types.arrays import Floats, Longs
+from lslam.core.types.scan_result import MotionCheck, ScanResult, motion_apart
+from lslam.core.types.trajectory import Keyframe, Segment
 from lslam.odometry.inertial.constant_velocity import ConstantVelocity
+from lslam.odometry.integrity.alerts import LARGE, Alert, alerts, stamp_faults
 from lslam.pipeline.manifest import Manifest
 
 log = logging.getLogger("lslam")
@@ -49,7 +50,7 @@ def join_segments(
     runs = groupby(range(len(results)), lambda k: results[k].segment if k >= first else -1)
     parts = [_part([results[k] for k in run], n, store, config) for n, (_, run) in enumerate(runs)]
     frames: list[list[_Part]] = []
-    with manifest.timed("segments_s"):
+    with manifest.time("segments_s"):
         for part in parts:
             _place(part, frames, config, should_stop)
     frames.sort(key=lambda frame: -sum(part.segment.registered for part in frame))
@@ -61,15 +62,16 @@ def join_segments(
         [replace(p, segment=replace(p.segment, reason=p.segment.reason or p.segment.tied_by or unfit)) for p in frame]
         for frame in frames[1:]
     ]
-    placed = sorted((part for frame in frames for part in frame), key=lambda part: part.segment.number)
-    moved = {part.segment.number: part.results for part in placed} | _chain(frames[0], store, config)
-    manifest.segments = [asdict(part.segment) for part in placed]
-    _say([part.segment for part in placed], manifest)
+    ordered = sorted((part for frame in frames for part in frame), key=lambda part: part.segment.number)
+    final = {part.segment.number: part.results for part in ordered} | _chain(frames[0], store, config)
+    manifest.segments = [asdict(part.segment) for part in ordered]
+    sentences = [sentence for part in ordered if (sentence := _sentence(part.segment))]
+    _report(sentences, manifest, "segments: see segments in manifest.json")
     # Where a frame of its own lies, nobody knows.
     return [
         replace(r, frame=part.segment.frame, may_be_elsewhere=part.segment.frame > 0)
-        for part in placed
-        for r in moved[part.segment.number]
+        for part in ordered
+        for r in final[part.segment.number]
     ]
 
 
@@ -105,21 +107,21 @@ def _place(part: _Part, frames: list[list[_Part]], config: Config, should_stop: 
 
 
 def _placement(
-    session: Session, known: Sequence[Session], config: Config, should_stop: Callable[[], bool]
+    session: Session, others: Sequence[Session], config: Config, should_stop: Callable[[], bool]
 ) -> tuple[Session | None, str]:
-    """The session placed among the known ones, and the evidence in words; None, and the reason, if it is not found.
+    """The session placed among the others, and the evidence in words; None, and the reason, if it is not found.
 
     If no second keyframe of it agrees, the last keyframes before it must.
     """
-    near = _vicinity(known[-1], session)
-    placed, reason = tie(session, known, config, should_stop, near)
+    near = _vicinity(others[-1], session)
+    placed, reason = tie(session, others, config, should_stop, near)
     if placed is None or placed.start is None:
         return None, reason
     start = placed.start
     evidence = f"place search: {start.votes} of {start.tried} keyframes tried agree"
     if start.has_agreement:
         return placed, evidence
-    if start.has_majority and _is_found_from_before(placed, known[-1], near.reach, config, should_stop):
+    if start.has_majority and _is_found_from_before(placed, others[-1], near.reach, config, should_stop):
         return placed, f"{evidence}, and the last ones before it"
     return None, "it is too short for two of its keyframes to agree on a place, and those before it are not found there"
 
@@ -161,11 +163,11 @@ def _chain(frame: Sequence[_Part], store: KeyframeStore, config: Config) -> dict
     sessions = [part.session for part in frame if part.session is not None]
     if not sessions:
         return {}
-    drive, kept, out = Chain(sessions, config), [], {}
+    drive, keyframes_now, out = Chain(sessions, config), list[Keyframe](), {}
     keyframes = drive.keyframes()
     for n, session in enumerate(sessions):
-        chained = keyframes[drive.part(n)]
-        first, T = chained[0], session.T_town_session
+        part = keyframes[drive.part(n)]
+        first, T = part[0], session.T_town_session
         # What the first scan of the segment knows of its own map is small beside the tie.
         base = np.zeros((6, 6)) if n == 0 or first.covariance is None else first.covariance
         out[session.results[0].segment] = [_move(r, T, first.T_world_lidar[:3, 3], base) for r in session.results]
@@ -174,12 +176,12 @@ def _chain(frame: Sequence[_Part], store: KeyframeStore, config: Config) -> dict
             last = sessions[n - 1]
             out[last.results[0].segment] = _bridge(out[last.results[0].segment], last.T_town_session, session)
         of_scan = {r.stamp_ns: r for r in out[session.results[0].segment]}
-        for own, now in zip(session.store.whole, chained, strict=True):
+        for own, now in zip(session.store.whole, part, strict=True):
             moved = of_scan[own.stamp_ns]
-            kept.append(
+            keyframes_now.append(
                 replace(own, T_world_lidar=moved.T_world_lidar, covariance=moved.covariance, distance=now.distance)
             )
-    store.keep(kept)
+    store.keep(keyframes_now)
     store.save()
     return out
 
@@ -206,17 +208,17 @@ def _move(result: ScanResult, T: Floats, origin: Floats, base: Floats) -> ScanRe
     """Result in the world reached by T (4, 4), with its covariance added to that of the segment's `origin` (3,), m."""
     moved = result.in_world(T)
 
-    def chained(own: Floats | None) -> Floats | None:
+    def transport(own: Floats | None) -> Floats | None:
         step = moved.T_world_lidar[:3, 3] - origin
         return None if own is None else np.asarray(own + noise.transport(base, step))
 
-    return replace(moved, covariance=chained(moved.covariance), points_covariance=chained(moved.points_covariance))
+    return replace(moved, covariance=transport(moved.covariance), points_covariance=transport(moved.points_covariance))
 
 
-def _say(segments: Sequence[Segment], manifest: Manifest) -> None:
-    sentences = [sentence for segment in segments if (sentence := _sentence(segment))]
+def _report(sentences: list[str], manifest: Manifest, others: str) -> None:
+    """Add the first sentences to the problems of the run, and a last one about the `others`, which says where they are."""
     if (more := len(sentences) - MAX_SENTENCES) > 0:
-        sentences = [*sentences[:MAX_SENTENCES], f"and {more} more segments: see segments in manifest.json"]
+        sentences = [*sentences[:MAX_SENTENCES], f"and {more} more {others}"]
     for sentence in sentences:
         log.warning("%s", sentence)
     manifest.problems += sentences
@@ -229,3 +231,69 @@ def _sentence(segment: Segment) -> str:
     if segment.tied_by:
         return f"tracking was lost before scan {segment.first}; {what}: tied to those before by {segment.tied_by}"
     return ""
+
+
+def raise_alerts(results: list[ScanResult], checks: list[MotionCheck], manifest: Manifest) -> list[ScanResult]:
+    """Results with the scans that the integrity monitor contradicts marked lost; the manifest gets a problem for each stretch."""
+    positions, stamps_ns = _positions(results)
+    stretches = alerts(checks, positions, stamps_ns)
+    _check_stamps(results, positions, stamps_ns)
+    manifest.integrity = {
+        "checks": len(checks),
+        "conclusive": sum(check.is_conclusive for check in checks),
+        "alerts": len(stretches),
+    }
+    return _mark(results, stretches, manifest, "")
+
+
+def raise_final_alerts(
+    results: list[ScanResult], checks: list[MotionCheck], manifest: Manifest, cause: str
+) -> list[ScanResult]:
+    """Results after `cause`, with scans marked lost that only the final poses contradict.
+
+    The monitor's measurements between scans are compared with the motion of the final poses.
+    """
+    stretches = alerts([_of_final_poses(check, results) for check in checks], *_positions(results))
+    new = [
+        alert for alert in stretches if not all(results[k].may_be_elsewhere for k in range(alert.first, alert.last + 1))
+    ]
+    manifest.integrity["final_alerts"] = len(new)
+    return _mark(results, new, manifest, f"after {cause}, ")
+
+
+def _of_final_poses(check: MotionCheck, results: list[ScanResult]) -> MotionCheck:
+    """Motion check with the motion of the final poses."""
+    motion = se3.relative(results[check.first].T_world_lidar, results[check.last].T_world_lidar)
+    # How many points lie on surfaces at a pose that was moved far was not counted: as good as none.
+    is_far = bool(np.any(np.abs(motion_apart(check.claimed_motion, motion)) > LARGE))
+    return replace(check, claimed_motion=motion, claimed_agreement=0.0 if is_far else check.claimed_agreement)
+
+
+def _check_stamps(results: list[ScanResult], positions: Floats, stamps_ns: Longs) -> None:
+    """Warn of wrong stamps: poses follow each other steadily, but the stamps do not. No scan is lost."""
+    at, off_s = stamp_faults(positions, stamps_ns)
+    if at:
+        log.warning(
+            "the stamps of %d of %d scans, the first is scan %d, are wrong by up to %.0f ms: at the period of the sensor the "
+            "poses follow each other steadily, by their stamps they jump; it spoils speeds, deskewing and the use of an IMU",
+            len(at),
+            len(results),
+            results[at[0]].index,
+            1e3 * off_s,
+        )
+
+
+def _positions(results: list[ScanResult]) -> tuple[Floats, Longs]:
+    positions = np.stack([r.at_stamp.T_world_lidar[:3, 3] for r in results])
+    return positions, np.array([r.stamp_ns for r in results])
+
+
+def _mark(results: list[ScanResult], stretches: list[Alert], manifest: Manifest, after: str) -> list[ScanResult]:
+    sentences = []
+    for alert in stretches:
+        first, last = results[alert.first].index, results[alert.last].index
+        scans = f"scan {first}" if first == last else f"scans {first} to {last}"
+        sentences.append(f"{after}{scans} may be lost: {alert.why}")
+    _report(sentences, manifest, "stretches of scans that may be lost: see scans.csv")
+    lost = {k for alert in stretches for k in range(alert.first, alert.last + 1)}
+    return [replace(r, may_be_elsewhere=True) if k in lost else r for k, r in enumerate(results)]

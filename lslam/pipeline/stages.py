@@ -20,7 +20,6 @@ from lslam.core.errors import (
     InputError,
     InterruptedRunError,
     LslamError,
-    OutputError,
     RunFailedError,
     RunFinishedError,
 )
@@ -34,16 +33,14 @@ from lslam.maps.crispness import crispness
 from lslam.odometry.base import FeatureSource
 from lslam.osm.corrections import write_buildings
 from lslam.pipeline import outputs
-from lslam.pipeline.back_end_pass import describe, level_world, optimise_poses, write_back_end
-from lslam.pipeline.colour_pass import build_finished_map
-from lslam.pipeline.feature_map_pass import build_feature_map, view_features
+from lslam.pipeline.back_end_pass import describe, level_world, optimise_poses, refine_poses, write_back_end
+from lslam.pipeline.further_passes import build_feature_map, build_finished_map, view_features
 from lslam.pipeline.job import PreparedRun, fit_to_scene, stoppable
 from lslam.pipeline.localise_pass import localise_poses
 from lslam.pipeline.manifest import Manifest
 from lslam.pipeline.map_pass import map_checkpoints
 from lslam.pipeline.odometry_pass import odometry_checkpoints
 from lslam.pipeline.precompile import load_parts
-from lslam.pipeline.refine_pass import refine_poses
 from lslam.pipeline.resume import may_go_on, run_identity
 from lslam.pipeline.run_folder import KEYFRAMES, RunFolder, check_place, spool_of, upload
 
@@ -61,19 +58,18 @@ def finalise_poses(job: PreparedRun, record: RunRecord) -> BackEnd:
         if record.georeference is not None:
             job.manifest.georeference = describe(record.georeference)
         return BackEnd(record.results)
-    done = optimise_poses(job, record)
-    done = refine_poses(job, record, done)
+    back_end = refine_poses(job, record, optimise_poses(job, record))
     level_world(record, job.sequence, job.config, job.manifest)
-    record.loop_view = view_loop(record, done, job.store)
+    record.loop_view = view_loop(record, back_end, job.store)
     record.pair_views = view_pairs(record, job.store, job.config.keyframes.submap_size)
-    return done
+    return back_end
 
 
 def _load(job: PreparedRun, *parts: str) -> None:
     """After a cold start, compile or load the kernels of these parts. At others each is loaded when it is called."""
     if not jit.did_compile():
         return
-    with job.manifest.timed("compile_s"), rarely_collecting(), jit.count_kernels(log, None):
+    with job.manifest.time("compile_s"), rarely_collecting(), jit.count_kernels(log, None):
         load_parts(job.config, parts)
 
 
@@ -109,25 +105,24 @@ def make_map(folder: RunFolder, job: PreparedRun, record: RunRecord) -> None:
     if not config.map.write or manifest.outcome == "interrupted":
         return
     watch.on_start("map", len(record.results))
-    with manifest.timed("map_s"), stoppable(job, "interrupted while the map was written"):
+    with manifest.time("map_s"), stoppable(job, "interrupted while the map was written"):
         built = build_finished_map(
             job.sequence,
             record.results,
             config,
-            watch.on_step,
-            watch.should_stop,
+            watch,
             folder.path,
             map_checkpoints(folder, config),
             manifest.problems,
         )
-        score = crispness(built.merged) if config.map.voxel else None
+        score = crispness(built.cloud) if config.map.voxel else None
         outputs.write_map(folder, built, config.map, record)
         record.map_file = f"map.{config.map.format}"
         if not record.map_fixes:  # else the page shows the drive on the map that it was located in
             record.map_sample, record.map_extent = built.sample, built.view.extent
             record.map_image, record.map_heights = built.view.image, built.view.heights
         record.crispness = score
-        manifest.map_points, manifest.map_colour = len(built.merged), built.colour
+        manifest.map_points, manifest.map_colour = len(built.cloud), built.colour
 
 
 def make_feature_map(folder: RunFolder, job: PreparedRun, record: RunRecord) -> None:
@@ -136,18 +131,11 @@ def make_feature_map(folder: RunFolder, job: PreparedRun, record: RunRecord) -> 
     if not config.map.write_features or manifest.outcome == "interrupted" or not isinstance(odometry, FeatureSource):
         return
     watch.on_start("feature map", len(record.results))
-    with manifest.timed("feature_map_s"), stoppable(job, "interrupted while the feature map was written"):
-        built = build_feature_map(
-            job.sequence,
-            odometry,
-            record.results,
-            config,
-            watch.on_step,
-            watch.should_stop,
-            map_checkpoints(folder, config, "feature map"),
-        )
-        outputs.write_feature_map(folder, built)
-        log.info("feature map: %d points in %s", len(built), folder.path / "feature_map.ply")
+    with manifest.time("feature_map_s"), stoppable(job, "interrupted while the feature map was written"):
+        checkpoints = map_checkpoints(folder, config, "feature map")
+        features = build_feature_map(job.sequence, odometry, record.results, config, watch, checkpoints)
+        outputs.write_feature_map(folder, features)
+        log.info("feature map: %d points in %s", len(features), folder.path / "feature_map.ply")
 
 
 def make_report(folder: RunFolder, job: PreparedRun, record: RunRecord, evaluation: Evaluation | None) -> None:
@@ -156,7 +144,7 @@ def make_report(folder: RunFolder, job: PreparedRun, record: RunRecord, evaluati
     job.watch.on_start("report", 0)
     manifest.take_over(record)
     record.manifest = manifest.conclude()
-    with manifest.timed("report_s"):
+    with manifest.time("report_s"):
         if job.config.report.html:
             if isinstance(job.odometry, FeatureSource):
                 record.features = view_features(job.sequence, job.odometry, record.results)
@@ -183,7 +171,7 @@ def in_folder(
     if place is not None:
         check_place(place, overwrite or resume)
     manifest.identity = run_identity(
-        job.sequence, job.truth, job.config, job.given, None if job.wheels.motion is None else job.wheels.motion.wheels
+        job.sequence, job.truth, job.config, job.poses, None if job.wheels.motion is None else job.wheels.motion.wheels
     )
     if place is not None and resume:
         may_go_on(place, manifest.identity, job.config)
@@ -196,12 +184,12 @@ def in_folder(
         raise
     with RunFolder(path, overwrite or resume or place is not None, goes_on) as folder:
         try:
-            yield _begun(job, folder, goes_on, earlier)
+            yield _begin(job, folder, goes_on, earlier)
         except BaseException as error:
             word = manifest.word_for(error)
             # A run that was stopped before it knew its configuration has nothing to go on with, and begins anew.
             if word != "interrupted" or (folder.path / "config.toml").is_file():
-                _write_last(folder, manifest.as_dict(word, str(error) or type(error).__name__))
+                folder.write_failure(manifest.as_dict(word, str(error) or type(error).__name__))
             raise
         if manifest.outcome != "interrupted":
             folder.keep_odometry()
@@ -213,7 +201,7 @@ def in_folder(
         upload(path, place)
 
 
-def _begun(job: PreparedRun, folder: RunFolder, goes_on: bool, earlier: EarlierRun | None) -> PreparedRun:
+def _begin(job: PreparedRun, folder: RunFolder, goes_on: bool, earlier: EarlierRun | None) -> PreparedRun:
     """The run in its folder, with a manifest that marks it as running.
 
     Raises InputError when the odometry of the earlier run cannot be read.
@@ -231,14 +219,14 @@ def _begun(job: PreparedRun, folder: RunFolder, goes_on: bool, earlier: EarlierR
     return replace(job, store=store, folder=folder, checkpoints=checkpoints)
 
 
-def write_results(job: PreparedRun, record: RunRecord, done: BackEnd, evaluation: Evaluation | None) -> None:
+def write_results(job: PreparedRun, record: RunRecord, back_end: BackEnd, evaluation: Evaluation | None) -> None:
     """Write all results into the run's folder, if it has one, and the manifest into the record."""
     folder = job.folder
     if folder is None:
         job.manifest.take_over(record)
         record.manifest = job.manifest.conclude()
         return
-    write_back_end(folder.path, record, job.store, done)
+    write_back_end(folder.path, record, job.store, back_end)
     if job.osm is not None and record.buildings is not None:
         write_buildings(folder.path, record.buildings, job.osm.data)
     outputs.write_trajectories(folder, record, job.sequence.calibration)
@@ -252,14 +240,6 @@ def write_results(job: PreparedRun, record: RunRecord, done: BackEnd, evaluation
         outputs.write_evaluation(folder, record, evaluation)
     make_feature_map(folder, job, record)
     make_report(folder, job, record, evaluation)
-
-
-def _write_last(folder: RunFolder, manifest: dict[str, object]) -> None:
-    """Write the status after everything else; a full disk at this point must not hide the first error."""
-    try:
-        folder.write_manifest(manifest)
-    except OutputError as error:
-        log.error("%s", error)
 
 
 def raise_outcome(manifest: Manifest, config: Config, way_out: str) -> None:

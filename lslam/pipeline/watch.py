@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from lslam.core.stopping import Stop
 from lslam.core.types.arrays import Floats
 from lslam.core.types.cloud import ArrayCloud
 from lslam.core.types.run_record import RunRecord
@@ -55,9 +56,9 @@ class RunOutcome:
 
         Raises UsageError for another name, InputError for what the run does not have.
         """
-        return draw_figure(self._plotted(self.map if what in ON_THE_MAP else None), what)
+        return draw_figure(self._figure_data(self.map if what in ON_THE_MAP else None), what)
 
-    def _plotted(self, cloud: ArrayCloud | None = None) -> PlottedRun:
+    def _figure_data(self, cloud: ArrayCloud | None = None) -> PlottedRun:
         record = self.record
         return PlottedRun(
             record.name,
@@ -74,7 +75,8 @@ class RunOutcome:
     def _repr_html_(self) -> str:
         """Summary and trajectory, for notebooks."""
         return as_html(
-            summary(self.record, self.evaluation), draw_svg(lambda: draw_figure(self._plotted(), "trajectory", WIDTH))
+            summary(self.record, self.evaluation),
+            draw_svg(lambda: draw_figure(self._figure_data(), "trajectory", WIDTH)),
         )
 
 
@@ -90,3 +92,21 @@ class Watch:
     on_step: Callable[[], None] = lambda: None
     on_end: Callable[[RunOutcome], None] = lambda outcome: None
     should_stop: Callable[[], bool] = lambda: False
+
+
+SILENT = Watch()
+
+
+def watch_run(
+    stop: Stop,
+    on_start: Callable[[str, int], None] = lambda stage, total: None,
+    on_step: Callable[[], None] = lambda: None,
+    on_end: Callable[[RunOutcome], None] = lambda outcome: None,
+) -> Watch:
+    """Watch of a run that a signal ends at once before the first stage of scans, and after the scan in work from there on."""
+
+    def begin(stage: str, total: int) -> None:
+        on_start(stage, total)
+        stop.is_gentle = stage not in BEFORE_SCANS
+
+    return Watch(begin, on_step, on_end, stop)

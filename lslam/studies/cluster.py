@@ -37,7 +37,7 @@ _ALONE = threading.Lock()
 
 
 @contextmanager
-def connected(scheduler: str | None, local: str | None, title: str, *, is_persistent: bool = True) -> Iterator[Cluster]:
+def connect(scheduler: str | None, local: str | None, title: str, *, is_persistent: bool = True) -> Iterator[Cluster]:
     """Cluster of a scheduler "tcp://host:port", or a local one of N workers, "local:N"; `is_persistent` as in `Cluster`.
 
     Raises UsageError when Dask is missing or `local` is no number of workers; InputError when the scheduler does not answer.
@@ -54,10 +54,10 @@ def connected(scheduler: str | None, local: str | None, title: str, *, is_persis
         with (
             LocalCluster(
                 n_workers=count, threads_per_worker=1, dashboard_address=None, silence_logs=logging.CRITICAL, env=env
-            ) as made,
-            Client(made) as client,
+            ) as workers,
+            Client(workers) as client,
         ):
-            yield Cluster(client, made.scheduler_address, title, is_here=True, is_persistent=is_persistent)
+            yield Cluster(client, workers.scheduler_address, title, is_here=True, is_persistent=is_persistent)
         return
     assert scheduler is not None
     cluster = Cluster(_client(scheduler), scheduler, title, is_persistent=is_persistent)
@@ -133,15 +133,11 @@ class Cluster:
         if not jobs:
             return
         progress.on_start(self.title, len(jobs), "runs", self.at_once)
-        left = list(jobs)
-        while left := self._attempt(left, progress, on_done):
-            log.warning(
-                "the scheduler %s went away after %d of %d runs: it is waited for",
-                self.address,
-                len(jobs) - len(left),
-                len(jobs),
-            )
-            self._reconnect(len(jobs) - len(left), len(jobs))
+        rest = list(jobs)
+        while rest := self._attempt(rest, progress, on_done):
+            count = f"{len(jobs) - len(rest)} of {len(jobs)} runs"
+            log.warning("the scheduler %s went away after %s: it is waited for", self.address, count)
+            self._reconnect(count)
 
     def _attempt(self, jobs: Sequence[Job], progress: StudyProgress, on_done: Callable[[Job], None]) -> list[Job]:
         """Make the runs. Returns those left over if the scheduler is lost."""
@@ -150,16 +146,16 @@ class Cluster:
         for job in jobs:
             clear_attempt(job)
         context = WorkerContext(self.at_once, is_alone=False, is_persistent=self.is_persistent)
-        left = {
+        rest = {
             self.client.submit(perform, job, context, key=f"lslam-{k}-{job.digest}", pure=False): job
             for k, job in enumerate(jobs)
         }
         try:
-            for future in as_completed(list(left)):
+            for future in as_completed(list(rest)):
                 error = future.exception()
                 if future.cancelled() or self.client.status != "running":
                     break
-                job = left.pop(future)
+                job = rest.pop(future)
                 if error is None and not isinstance(job.folder, RemotePath):
                     unpack(future.result(), job)
                 ensure_state(job, "" if error is None else f"its worker failed: {error}", context)
@@ -168,11 +164,11 @@ class Cluster:
                 future.release()
         finally:
             if self.client.status == "running":
-                self.client.cancel(list(left), force=True)
-        return list(left.values())
+                self.client.cancel(list(rest), force=True)
+        return list(rest.values())
 
-    def _reconnect(self, done: int, of: int) -> None:
-        """A new client, once the scheduler answers and has a worker; raises RunFailedError when it does not."""
+    def _reconnect(self, count: str) -> None:
+        """A new client, once the scheduler answers and has a worker; raises RunFailedError, which says the `count`, if not."""
         with contextlib.suppress(Exception):  # of a connection that is lost
             self.client.close(timeout=1)
         until = time.monotonic() + _PATIENCE_S
@@ -183,7 +179,7 @@ class Cluster:
                 return
             if time.monotonic() > until:
                 raise RunFailedError(
-                    f"the scheduler {self.address} went away after {done} of {of} runs: start it, and the same command with "
+                    f"the scheduler {self.address} went away after {count}: start it, and the same command with "
                     "--resume goes on"
                 )
             time.sleep(_PAUSE_S)
@@ -255,8 +251,8 @@ def _inspect(paths: list[str]) -> tuple[str, list[str]]:
 
 def _paths_to_check(paths: Iterable[Path]) -> list[str]:
     """Paths that each worker shall look for: all on disks, and one of each folder in storage."""
-    found = {path.parent if isinstance(path, RemotePath) else path: str(path) for path in paths}
-    return sorted(found.values())
+    places = {path.parent if isinstance(path, RemotePath) else path: str(path) for path in paths}
+    return sorted(places.values())
 
 
 def _count(local: str) -> int:

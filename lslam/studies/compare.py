@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from lslam.core.config.outputs import EvalConfig
-from lslam.core.errors import InterruptedRunError, LslamError
+from lslam.core.errors import LslamError, UsageError
 from lslam.core.types.arrays import Floats
 from lslam.core.types.comparison import Comparison, Difference, Drawing, DrawnRun, RunScore
 from lslam.core.types.sequence import Sequence as Recording
@@ -23,14 +23,24 @@ from lslam.evaluation.metric import AbsoluteError
 from lslam.io.formats.trajectory_files import read_trajectory
 from lslam.io.readers import open_sequence
 from lslam.reports import compare_html, compare_table
-from lslam.studies.grid import Cell, Job, expand, fitted_scene, recorded_cell
-from lslam.studies.jobs import finished, pool_of, run_jobs
-from lslam.studies.output import COMPARISON, SIMULATED, lock_output, release_output
+from lslam.reports.picture import as_html
+from lslam.studies.grid import Cell, Job, expand, fit_scene, recorded_cell
+from lslam.studies.jobs import Local, left_to_do, study_folder
+from lslam.studies.options import (
+    COMPARISON,
+    ONE_TRUTH,
+    SIMULATED,
+    OutputOptions,
+    check_numbers,
+    folder_by_time,
+    require_free,
+)
 from lslam.studies.paired import TIE_M, compare_pairs, summarise
-from lslam.studies.plan import Plan, check_plan
+from lslam.studies.ready_comparison import ReadyComparison
 from lslam.studies.results import IMU, collect_run, metrics_of
 from lslam.studies.runner import StudyProgress
-from lslam.studies.subjects import Scene, Subject, scans_needed, simulate_once, with_range
+from lslam.studies.subjects import Scene, Subject, count_scans, find_subjects, simulate_once, with_range
+from lslam.studies.variants import Imu, Variant, find_variants
 
 log = logging.getLogger("lslam")
 PREFERRED = EvalConfig(align=("se3", "origin"))
@@ -41,7 +51,42 @@ BUSY = 0.5
 
 
 @dataclass(frozen=True)
-class Finished:
+class Plan:
+    """Sequences, methods and options of a comparison.
+
+    jobs : runs at once, with more than one times cannot be compared; truth : replaces that of the only sequence
+    crop : (x, y, size) of the map crop, m, None to choose; ready : that ships with lslam, which this is
+    """
+
+    subjects: tuple[Subject, ...]
+    variants: tuple[Variant, ...]
+    seeds: tuple[int, ...]
+    output: OutputOptions
+    jobs: int = 1
+    truth: Trajectory | None = None
+    crop: tuple[float, float, float] | None = None
+    ready: ReadyComparison | None = None
+
+    def variants_on(self, cell: Cell) -> Sequence[Variant]:
+        """The variants as they run on the recording of a cell."""
+        return self.variants if self.ready is None else self.ready.variants_on(self.variants, cell, self.output.out)
+
+
+def check_plan(plan: Plan) -> None:
+    """Raise UsageError for a plan that cannot be run."""
+    if not plan.variants:
+        raise UsageError("no method is named")
+    if not plan.subjects:
+        raise UsageError("no sequence is named")
+    check_numbers(plan.seeds, plan.jobs, plan.crop)
+    if plan.truth is not None and (len(plan.subjects) > 1 or plan.subjects[0].scenario):
+        raise UsageError(ONE_TRUTH)
+    if plan.crop is not None and not all(v.config.map.write for v in plan.variants):
+        raise UsageError("--crop needs maps, and map.write is off")
+
+
+@dataclass(frozen=True)
+class UsableRun:
     """A usable run with its trajectory."""
 
     job: Job
@@ -59,10 +104,10 @@ def draw(jobs: Sequence[Job], scores: Sequence[RunScore]) -> tuple[list[Drawing]
 
 def _draw(jobs: Sequence[Job], scores: Sequence[RunScore]) -> tuple[list[Drawing], list[Difference]]:
     drawings, differences = [], []
-    groups: dict[str, list[Finished]] = {}
+    groups: dict[str, list[UsableRun]] = {}
     for job, score in zip(jobs, scores, strict=True):
         if score.is_usable:
-            groups.setdefault(job.sequence, []).append(Finished(job, read_trajectory(job.folder)))
+            groups.setdefault(job.sequence, []).append(UsableRun(job, read_trajectory(job.folder)))
     for sequence, runs in groups.items():
         seed = runs[0].job.seed
         shown = [run for run in runs if run.job.seed == seed]
@@ -90,7 +135,7 @@ def _only_warnings() -> Iterator[None]:
 
 
 def _in_world_of_truth(
-    sequence: str, seed: int, runs: Sequence[Finished], recording: Recording, truth: Trajectory
+    sequence: str, seed: int, runs: Sequence[UsableRun], recording: Recording, truth: Trajectory
 ) -> Drawing:
     scores = [evaluate(run.trajectory, truth, PREFERRED, calibration=recording.calibration) for run in runs]
     errors = [_available(list(score.ate.values())) for score in scores]
@@ -124,7 +169,7 @@ def _available(errors: list[AbsoluteError]) -> AbsoluteError:
     return next((error for error in errors if error.available), errors[-1])
 
 
-def _in_own_world(sequence: str, seed: int, runs: Sequence[Finished]) -> Drawing:
+def _in_own_world(sequence: str, seed: int, runs: Sequence[UsableRun]) -> Drawing:
     """Without ground truth: every run from the start that all share, and how far it is from the first, scan by scan."""
     drawn = []
     for run in runs:
@@ -135,7 +180,7 @@ def _in_own_world(sequence: str, seed: int, runs: Sequence[Finished]) -> Drawing
     return Drawing(sequence, seed, None, tuple(drawn), recipe, runs[0].job.method)
 
 
-def _apart(run: Finished, other: Finished) -> tuple[Floats | None, Floats | None]:
+def _apart(run: UsableRun, other: UsableRun) -> tuple[Floats | None, Floats | None]:
     """m along another run and from it at the poses that both have, from the same start; None where they share none."""
     try:
         score = evaluate(run.trajectory, other.trajectory, EvalConfig(align=("origin",)))
@@ -144,11 +189,11 @@ def _apart(run: Finished, other: Finished) -> tuple[Floats | None, Floats | None
     return score.distance, np.linalg.norm(score.ate["origin"].errors, axis=1)
 
 
-def _map_file(run: Finished) -> Path | None:
+def _map_file(run: UsableRun) -> Path | None:
     return next((path for path in sorted(run.job.folder.glob("map.*")) if path.suffix in (".ply", ".pcd")), None)
 
 
-def _differences(sequence: str, runs: Sequence[Finished]) -> list[Difference]:
+def _differences(sequence: str, runs: Sequence[UsableRun]) -> list[Difference]:
     """Every run against the reference's of the same seed, over the poses they share."""
     out = []
     reference = runs[0].job.method
@@ -167,8 +212,8 @@ def _differences(sequence: str, runs: Sequence[Finished]) -> list[Difference]:
     return out
 
 
-def compare(plan: Plan, progress: StudyProgress | None = None) -> Comparison:
-    """Run every method on every sequence and seed, and write compare.csv, .tex, .json and .html into `plan.out`.
+def run_comparison(plan: Plan, progress: StudyProgress | None = None) -> Comparison:
+    """Run every method on every sequence and seed, and write compare.csv, .tex, .json and .html into the output folder.
 
     Raises
     ------
@@ -178,29 +223,20 @@ def compare(plan: Plan, progress: StudyProgress | None = None) -> Comparison:
     """
     progress = progress or StudyProgress()
     check_plan(plan)
-    lock_output(plan.out, COMPARISON, "comparison", plan.overwrite, plan.resume)
-    if not (plan.out / COMPARISON).is_file():
-        compare_table.write_running(plan.out / COMPARISON, plan.command)
-    jobs: list[Job] = []
-    try:
+    output, out, jobs = plan.output, plan.output.out, list[Job]()
+    with study_folder(output, COMPARISON, jobs):
+        if not (out / COMPARISON).is_file():
+            compare_table.write_running(out / COMPARISON, output.command)
         for cell in _cells(plan, progress):
-            jobs += expand([cell], plan.fitted(cell), plan.seeds, plan.out, plan.command)
-        kept = set() if plan.overwrite else finished(jobs)
-        left = [replace(job, goes_on=plan.resume) for job in jobs if job.folder not in kept]
-        run_jobs(left, pool_of(plan.jobs, len(left), is_persistent=plan.ready is not None), progress)
-    except KeyboardInterrupt:
-        raise InterruptedRunError(
-            f"interrupted; {len(finished(jobs))} of {len(jobs) or 'all'} runs are finished in {plan.out}: the same command with "
-            "--resume goes on"
-        ) from None
-    except LslamError:
-        release_output(plan.out, COMPARISON)
-        raise
-    scores = [collect_run(job, job.folder in kept) for job in jobs]
+            jobs += expand([cell], plan.variants_on(cell), plan.seeds, out, output.command)
+        left = left_to_do(output, jobs)
+        Local(plan.jobs, plan.ready is not None, "comparing", tries=1).run(left, progress)
+    folders = {job.folder for job in left}
+    scores = [collect_run(job, job.folder not in folders) for job in jobs]
     comparison, drawings = _weigh(plan, jobs, scores)
-    compare_table.write_files(plan.out, comparison)
-    compare_html.write_page(plan.out / "compare.html", comparison, drawings, plan.crop)
-    compare_table.write_result(plan.out / COMPARISON, comparison)
+    compare_table.write_files(out, comparison)
+    compare_html.write_page(out / "compare.html", comparison, drawings, plan.crop)
+    compare_table.write_result(out / COMPARISON, comparison)
     return comparison
 
 
@@ -208,27 +244,20 @@ def _cells(plan: Plan, progress: StudyProgress) -> list[Cell]:
     """Recordings as they are, scenarios simulated once per seed."""
     needs_imu = any(variant.config.imu.use for variant in plan.variants)
     # What cannot be opened, or has no IMU though one is asked for, is said before anything is simulated.
-    recorded = {
-        s.label: recorded_cell(
-            s.label, s.path, needs_imu=needs_imu, truth=plan.truth, data_root=plan.data_root, own=s.range
-        )
+    root = plan.output.data_root
+    recordings = {
+        s.label: recorded_cell(s.label, s.path, needs_imu=needs_imu, truth=plan.truth, data_root=root, own=s.range)
         for s in plan.subjects
         if s.path is not None
     }
     scenes = {s.label: _scene(plan, s) for s in plan.subjects if s.scenario is not None}
     cells = []
     for subject in plan.subjects:
-        if subject.label in recorded:
-            cells.append(recorded[subject.label])
+        if subject.label in recordings:
+            cells.append(recordings[subject.label])
             continue
         for seed in plan.seeds:
-            path = simulate_once(
-                scenes[subject.label],
-                seed,
-                plan.out / SIMULATED,
-                lambda stage, total: progress.on_start(stage, total, "scans", 1),
-                lambda: progress.on_step(""),
-            )
+            path = simulate_once(scenes[subject.label], seed, plan.output.out / SIMULATED, progress)
             cells.append(recorded_cell(subject.label, path, seed, needs_imu=needs_imu, own=subject.range))
     return cells
 
@@ -236,8 +265,8 @@ def _cells(plan: Plan, progress: StudyProgress) -> list[Cell]:
 def _scene(plan: Plan, subject: Subject) -> Scene:
     """What is simulated of a scenario; raises UsageError when it ends before the scans that are used."""
     assert subject.scenario is not None
-    needed = scans_needed([with_range(v.config, subject.range).input for v in plan.variants])
-    return fitted_scene(Scene(subject.scenario), needed, subject.range, plan.seeds)
+    needed = count_scans([with_range(v.config, subject.range).input for v in plan.variants])
+    return fit_scene(Scene(subject.scenario), needed, subject.range, plan.seeds)
 
 
 def _notes(scores: Sequence[RunScore]) -> list[str]:
@@ -261,7 +290,7 @@ def _weigh(plan: Plan, jobs: Sequence[Job], scores: Sequence[RunScore]) -> tuple
     drawings, differences = draw(jobs, scores)
     methods = tuple(variant.name for variant in plan.variants)
     return Comparison(
-        command=plan.command,
+        command=plan.output.command,
         methods=methods,
         sequences=tuple(subject.label for subject in plan.subjects),
         metrics=tuple(metrics_of([variant.config.eval for variant in plan.variants], scores)),
@@ -274,3 +303,59 @@ def _weigh(plan: Plan, jobs: Sequence[Job], scores: Sequence[RunScore]) -> tuple
         tie=TIE_M,
         beside=() if plan.ready is None else plan.ready.beside(scores),
     ), drawings
+
+
+@dataclass(frozen=True)
+class CompareOutcome:
+    """Result of `compare`: all numbers, and the folder of the runs with the page `compare.html`."""
+
+    comparison: Comparison
+    folder: Path
+
+    def table(self, style: str = "text") -> str:
+        """Tables as `text`, `md`, `csv` (a row per run) or `tex`."""
+        return compare_table.render(self.comparison, style)
+
+    def __str__(self) -> str:
+        """Tables as text."""
+        return self.table()
+
+    def _repr_html_(self) -> str:
+        return as_html(self.table())
+
+
+def compare(
+    sequences: Iterable[str | Path],
+    methods: Iterable[str],
+    *,
+    seeds: Iterable[int] = (0,),
+    out: str | Path | None = None,
+    jobs: int = 1,
+    imu: Imu | None = None,
+    settings: Iterable[str] = (),
+    overwrite: bool = False,
+    resume: bool = False,
+) -> CompareOutcome:
+    """Run methods on the same sequences, and weigh them against each other.
+
+    Parameters
+    ----------
+    sequences : recordings as `open_sequence` takes them, or names of scenarios, which are simulated once per seed
+    methods : names of methods or presets, or TOML files; the first is the reference
+    out : folder of all runs (default: runs/compare-TIME); jobs : runs at once, times are comparable with one only
+    imu : `both` makes two of each, `on` and `off` one; settings : "map.voxel=0.1", of all runs
+
+    Raises
+    ------
+    UsageError, InputError and OutputError as the command does.
+
+    Notes
+    -----
+    Runs are processes of their own: in a script call it below ``if __name__ == "__main__":``.
+    """
+    folder = Path(out) if out is not None else folder_by_time("compare")
+    output = OutputOptions(folder, overwrite, resume, command="lslam.compare")
+    require_free(output, COMPARISON)
+    subjects = tuple(find_subjects([str(sequence) for sequence in sequences]))
+    variants = tuple(find_variants(list(methods), None, list(settings), imu))
+    return CompareOutcome(run_comparison(Plan(subjects, variants, tuple(seeds), output, jobs)), folder)

@@ -20,14 +20,14 @@ from lslam.studies.jobs import Local
 from lslam.studies.results import Results
 from lslam.studies.results_csv import FINAL, read_state
 from lslam.studies.runner import StudyProgress
-from lslam.studies.subjects import drive_of, simulate_once, used
-from lslam.studies.sweep import write_study_report
+from lslam.studies.study_runs import write_study_report
+from lslam.studies.subjects import drive_of, scans_of_run, simulate_once
 from lslam.studies.variants import Variant
 
 # Scans of the shorter and the longer pilot: what they differ by is what scans cost, the rest what a run costs by itself.
 _SHORT, _LONG = 12, 36
 # Scans of a recording that are simulated for pilots from the first one used, at most.
-_SIMULATED = 160
+_MOST_SCANS = 160
 
 
 @dataclass(frozen=True)
@@ -69,31 +69,31 @@ class _Pilot:
 class _Group:
     """Runs that differ only in parameters and seeds.
 
-    names : of their variants; X : (names, K) where they lie; chosen : those with pilots; pilots : a short and a long one each
+    names : of their variants; X : (names, K) where they lie; at : those with pilots; pilots : a short and a long one each
     """
 
     members: list[Job]
     recording: _PilotRecording
     names: list[str]
     X: Floats
-    chosen: list[int]
+    at: list[int]
     pilots: list[list[_Pilot]]
 
 
-def from_finished(jobs: Sequence[Job], left: Sequence[Job], variants: dict[str, Variant], at_once: int) -> Guess | None:
-    """Time for the `left` of a study's `jobs`, s, from the times of its finished runs; None without any.
+def extrapolate(jobs: Sequence[Job], rest: Sequence[Job], variants: dict[str, Variant], at_once: int) -> Guess | None:
+    """Time for the `rest` of a study's `jobs`, s, from the times of its finished runs; None without any.
 
-    A run is taken to last as long as the mean of its sequence and method, or of all runs where none of these is finished.
+    A run is expected to last as long as the mean of its sequence and method, or of all runs where none of these is finished.
     """
-    taken: dict[object, list[float]] = {}
+    seconds: dict[object, list[float]] = {}
     for job in jobs:
         state = read_state(job.state_file)
         if state is not None and state.status in FINAL and state.digest == job.digest:
-            taken.setdefault(_kind(job, variants), []).append(state.seconds)
-    every = [seconds for group in taken.values() for seconds in group]
+            seconds.setdefault(_kind(job, variants), []).append(state.seconds)
+    every = [one for group in seconds.values() for one in group]
     if not every:
         return None
-    return Guess(sum(float(np.mean(taken.get(_kind(job, variants), every))) for job in left) / at_once, 0)
+    return Guess(sum(float(np.mean(seconds.get(_kind(job, variants), every))) for job in rest) / at_once, 0)
 
 
 def estimate(
@@ -137,16 +137,16 @@ def _group(members: list[Job], recording: _PilotRecording, variants: dict[str, V
     names = list(dict.fromkeys(job.method for job in members))
     first = {job.method: job for job in members}
     X = _coordinates([variants[name] for name in names])
-    chosen = _pilot_points(X)
-    return _Group(members, recording, names, X, chosen, [_pilots(first[names[k]], recording) for k in chosen])
+    at = _pilot_points(X)
+    return _Group(members, recording, names, X, at, [_pilots(first[names[k]], recording) for k in at])
 
 
 def _seconds(group: _Group, base: Floats, per_scan: Floats) -> float:
     """Time for all runs of the group, s, extrapolated from its pilots."""
     first = {job.method: job for job in group.members}
     seconds = 0.0
-    for name, cost in zip(group.names, _at(group.X, group.X[group.chosen], base, per_scan), strict=True):
-        scans = used(group.recording.whole, first[name].config.input)
+    for name, cost in zip(group.names, _interpolate(group.X, group.X[group.at], base, per_scan), strict=True):
+        scans = scans_of_run(group.recording.whole, first[name].config.input)
         seconds += sum(job.method == name for job in group.members) * float(cost[0] + cost[1] * scans)
     return seconds
 
@@ -181,15 +181,9 @@ def _places(jobs: Sequence[Job], folder: Path, progress: StudyProgress) -> dict[
             continue
         whole = len(drive_of(job.scene, job.seed))
         start = max(other.config.input.start for other in jobs if other.sequence == job.sequence)
-        part = replace(job.scene, scans=min(whole, start + _SIMULATED))
+        part = replace(job.scene, scans=min(whole, start + _MOST_SCANS))
         began = time.monotonic()
-        path = simulate_once(
-            part,
-            job.seed,
-            folder,
-            lambda stage, total: progress.on_start(stage, total, "scans", 1),
-            lambda: progress.on_step(""),
-        )
+        path = simulate_once(part, job.seed, folder, progress)
         assert part.scans is not None
         places[job.sequence] = _PilotRecording(path, part.scans, whole, (time.monotonic() - began) * whole / part.scans)
     return places
@@ -209,13 +203,13 @@ def _coordinates(points: Sequence[Variant]) -> Floats:
 
 def _pilot_points(X: Floats) -> list[int]:
     """Indices of the points nearest to the corners and the middle, without repetitions."""
-    wanted = [*product((0.0, 1.0), repeat=X.shape[1]), (0.5,) * X.shape[1]]
-    return list(dict.fromkeys(int(np.argmin(np.sum((X - np.array(w)) ** 2, axis=1))) for w in wanted))
+    places = [*product((0.0, 1.0), repeat=X.shape[1]), (0.5,) * X.shape[1]]
+    return list(dict.fromkeys(int(np.argmin(np.sum((X - np.array(place)) ** 2, axis=1))) for place in places))
 
 
 def _pilots(job: Job, recording: _PilotRecording) -> list[_Pilot]:
     """Short and long pilot of each chosen point."""
-    most = used(recording.scans, job.config.input)
+    most = scans_of_run(recording.scans, job.config.input)
     long = min(_LONG, most)
     pilots = []
     for scans in (max(1, min(_SHORT, long // 2)), long):
@@ -247,19 +241,19 @@ def _report_s(folder: Path, pilots: Sequence[Job], variants: dict[str, Variant])
     return time.monotonic() - began
 
 
-def _costs(made: Sequence[Sequence[_Pilot]], times: Sequence[float]) -> tuple[Floats, Floats]:
+def _costs(pairs: Sequence[Sequence[_Pilot]], times: Sequence[float]) -> tuple[Floats, Floats]:
     """(P,) s per run and (P,) s per scan of the pairs of pilots."""
-    t = np.array(times).reshape(len(made), 2)
-    n = np.array([[pilot.scans for pilot in pair] for pair in made], np.float64)
+    t = np.array(times).reshape(len(pairs), 2)
+    n = np.array([[pilot.scans for pilot in pair] for pair in pairs], np.float64)
     per_scan = (t[:, 1] - t[:, 0]) / np.maximum(n[:, 1] - n[:, 0], 1)
     # A pause of the machine may hide what scans cost, but they are never free.
     per_scan = np.maximum(per_scan, 0.3 * t[:, 1] / n[:, 1])
     return np.maximum(t[:, 1] - per_scan * n[:, 1], 0), per_scan
 
 
-def _at(X: Floats, known: Floats, base: Floats, per_scan: Floats) -> Floats:
-    """(N, 2) costs at points X, linear in the studied values and clipped to the measured range."""
+def _interpolate(X: Floats, pilots: Floats, base: Floats, per_scan: Floats) -> Floats:
+    """(N, 2) costs at points X, linear in the studied values and clipped to the range of the pilots, at (P, K)."""
     values = np.column_stack([base, per_scan])
-    ones = [np.column_stack([np.ones(len(x)), x]) for x in (known, X)]
-    fitted = ones[1] @ np.linalg.lstsq(ones[0], values, rcond=None)[0]
-    return np.asarray(np.clip(fitted, values.min(axis=0), values.max(axis=0)))
+    ones = [np.column_stack([np.ones(len(x)), x]) for x in (pilots, X)]
+    costs = ones[1] @ np.linalg.lstsq(ones[0], values, rcond=None)[0]
+    return np.asarray(np.clip(costs, values.min(axis=0), values.max(axis=0)))

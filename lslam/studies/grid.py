@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,8 +17,8 @@ from lslam.io.readers import find_folder, open_sequence
 from lslam.io.readers.kitti_raw import with_imu
 from lslam.io.remote import RemotePath, as_path
 from lslam.pipeline.resume import imu_digest, input_digest, job_digest, listing_digest
-from lslam.studies.output import SIMULATED, OutputOptions
-from lslam.studies.subjects import Scene, check_range, drive_of, scans_needed, scene_digest, scene_folder, with_range
+from lslam.studies.options import SIMULATED, OutputOptions
+from lslam.studies.subjects import Scene, check_range, count_scans, drive_of, scene_digest, scene_folder, with_range
 from lslam.studies.variants import Variant, free_name
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ class Cell:
     digest : of the input; imu : likewise of its IMU, empty when no run asks for it
     data_root : where the IMU of a KITTI odometry sequence is looked for
     scene : simulated with `seed` if `path` does not exist yet; range : scans used, overriding the configuration
-    refusal : why the recording cannot be read: the error of its runs
+    refusal : why the recording cannot be read: the error of its runs; reading : further options of `open_sequence`
     """
 
     sequence: str
@@ -46,6 +46,25 @@ class Cell:
     scene: Scene | None = None
     range: ScanRange = AS_CONFIGURED
     refusal: str = ""
+    reading: Mapping[str, Any] = field(default_factory=dict)
+
+    def job(self, method: str, seed: int, config: Config, folder: Path, command: str) -> Job:
+        """Run of the recording by a `config` that has the scans used; method : name of the variant."""
+        return Job(
+            self.sequence,
+            method,
+            seed,
+            self.path,
+            config,
+            folder,
+            job_digest(config, self.digest, self.imu),
+            command,
+            self.truth,
+            self.data_root,
+            self.scene,
+            self.reading,
+            refusal=self.refusal,
+        )
 
 
 @dataclass(frozen=True)
@@ -53,9 +72,8 @@ class Job:
     """One run: all that a process needs to make it.
 
     method : the variant's name, the method of `config` or a preset that says more than a method
-    digest : two jobs of one digest have the same result; scene : as of the cell; reading : further options of `open_sequence`
+    digest : two jobs of one digest have the same result; truth to refusal : as of the cell
     goes_on : resume an unfinished run
-    refusal : why the recording cannot be read, empty when it can
     """
 
     sequence: str
@@ -69,7 +87,7 @@ class Job:
     truth: Trajectory | None = None
     data_root: Path | None = None
     scene: Scene | None = None
-    reading: dict[str, Any] = field(default_factory=dict)
+    reading: Mapping[str, Any] = field(default_factory=dict)
     goes_on: bool = False
     refusal: str = ""
 
@@ -105,25 +123,8 @@ def expand(
                     config = variant.with_seed(seed)
                 elif cell.seed is None and seed != seeds[0]:
                     continue
-                config = with_range(config, cell.range)
                 folder = run_folder(out, cell.sequence, variant.name, seed)
-                digest = job_digest(config, cell.digest, cell.imu)
-                jobs.append(
-                    Job(
-                        cell.sequence,
-                        variant.name,
-                        seed,
-                        cell.path,
-                        config,
-                        folder,
-                        digest,
-                        command,
-                        cell.truth,
-                        cell.data_root,
-                        cell.scene,
-                        refusal=cell.refusal,
-                    )
-                )
+                jobs.append(cell.job(variant.name, seed, with_range(config, cell.range), folder, command))
     return jobs
 
 
@@ -152,15 +153,7 @@ def label_of(path: Path) -> str:
     return file_safe(stem_of(path))
 
 
-def scene_cell(scene: Scene, seed: int, parent: Path, own: ScanRange = AS_CONFIGURED) -> Cell:
-    """Cell of a simulation below `parent` that may still have to be made; its digest covers the future content and the IMU.
-
-    Raises UsageError, ConfigError or InputError for a scenario that is none.
-    """
-    return Cell(scene.name, scene_folder(scene, seed, parent), seed, scene_digest(scene, seed), scene=scene, range=own)
-
-
-def fitted_scene(scene: Scene, needed: int | None, own: ScanRange, seeds: Sequence[int]) -> Scene:
+def fit_scene(scene: Scene, count: int | None, own: ScanRange, seeds: Sequence[int]) -> Scene:
     """Scene with the number of scans that the study needs, unless it states one; its whole path if skipping needs more.
 
     own : ranges of scans, overriding the configurations; seeds : of the simulations, whose paths differ a little
@@ -169,15 +162,15 @@ def fitted_scene(scene: Scene, needed: int | None, own: ScanRange, seeds: Sequen
     if scene.scans is not None:
         check_range(scene.name, own, scene.scans)
         return scene
-    fitted = replace(scene, scans=needed)
+    enough = replace(scene, scans=count)
     if own.own:
         try:
-            ways = [drive_of(fitted, seed) for seed in seeds]
+            drives = [drive_of(enough, seed) for seed in seeds]
         except UsageError:
-            fitted = scene
-            ways = [drive_of(scene, seed) for seed in seeds]
-        check_range(scene.name, own, min(map(len, ways)))
-    return fitted
+            enough = scene
+            drives = [drive_of(scene, seed) for seed in seeds]
+        check_range(scene.name, own, min(map(len, drives)))
+    return enough
 
 
 def cells_of(
@@ -201,22 +194,21 @@ def cells_of(
     needs_imu = any(config.imu.use for config in configs)
     beaten = {setting.partition("=")[0].strip() for setting in settings}
     cells: list[Cell] = []
-    taken: set[str] = set()
+    names: set[str] = set()
     for sequence in sequences:
         own = ScanRange(**{key: value for key, value in sequence.own.items() if f"input.{key}" not in beaten})
-        needed = scans_needed([with_range(config, own).input for config in configs])
-        made = (
-            [_recorded(sequence.path, own, needs_imu, output, may_fail)]
-            if sequence.path
-            else _simulated(sequence, own, needed, seeds, output)
-        )
+        count = count_scans([with_range(config, own).input for config in configs])
+        if sequence.path:
+            own_cells = [_recording_cell(sequence.path, own, needs_imu, output, may_fail)]
+        else:
+            own_cells = _scene_cells(sequence, own, count, seeds, output)
         # The same recording with other settings is another sequence, with a folder of its own.
-        label = free_name(made[0].sequence, taken)
-        cells += [replace(cell, sequence=label) for cell in made]
+        label = free_name(own_cells[0].sequence, names)
+        cells += [replace(cell, sequence=label) for cell in own_cells]
     return cells
 
 
-def _recorded(word: str, own: ScanRange, needs_imu: bool, output: OutputOptions, may_fail: bool) -> Cell:
+def _recording_cell(word: str, own: ScanRange, needs_imu: bool, output: OutputOptions, may_fail: bool) -> Cell:
     path = as_path(word).expanduser().absolute()
     try:
         path = find_folder(word, output.data_root).absolute()
@@ -231,9 +223,14 @@ def _recorded(word: str, own: ScanRange, needs_imu: bool, output: OutputOptions,
         return Cell(label_of(path), path, None, "", data_root=output.data_root, range=own, refusal=str(error))
 
 
-def _simulated(
-    s: StudySequence, own: ScanRange, needed: int | None, seeds: Sequence[int], output: OutputOptions
+def _scene_cells(
+    s: StudySequence, own: ScanRange, count: int | None, seeds: Sequence[int], output: OutputOptions
 ) -> list[Cell]:
     scene = Scene(s.scenario, s.scans, s.lidar, s.columns, s.speed, s.compensated, s.imu, s.settings)
-    scene = fitted_scene(scene, needed, own, seeds)
-    return [scene_cell(scene, seed, output.scenes or output.out / SIMULATED, own) for seed in seeds]
+    scene = fit_scene(scene, count, own, seeds)
+    parent = output.scenes or output.out / SIMULATED
+    # Simulations may still have to be made: their digests cover the future content and the IMU.
+    return [
+        Cell(scene.name, scene_folder(scene, k, parent), k, scene_digest(scene, k), scene=scene, range=own)
+        for k in seeds
+    ]

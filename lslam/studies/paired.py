@@ -1,4 +1,4 @@
-"""Statistics over seeds and sequences: means with their spread, and paired comparisons with a reference."""
+"""Statistics over seeds and sequences: means with their mean_and_std, and paired comparisons with a reference."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def summarise(runs: Sequence[RunScore]) -> list[SummaryRow]:
     for (sequence, method), members in groups.items():
         usable = [run for run in members if run.is_usable]
         keys = dict.fromkeys(key for run in usable for key in run.values)
-        values = {key: spread([run.values[key] for run in usable if key in run.values]) for key in keys}
+        values = {key: mean_and_std([run.values[key] for run in usable if key in run.values]) for key in keys}
         note = next((run.note for run in usable if run.note), "")
         alone = all(run.jobs == 1 for run in usable)
         degraded = sum(run.status == "degraded" for run in usable)
@@ -33,11 +33,11 @@ def summarise(runs: Sequence[RunScore]) -> list[SummaryRow]:
     return rows
 
 
-def spread(values: Sequence[float]) -> SeedStatistics:
+def mean_and_std(values: Sequence[float]) -> SeedStatistics:
     """Mean and sample standard deviation of at least one value.
 
-    >>> spread([1.0, 3.0])
-    Spread(mean=2.0, std=1.4142135623730951, n=2)
+    >>> mean_and_std([1.0, 3.0])
+    SeedStatistics(mean=2.0, std=1.4142135623730951, n=2)
     """
     array = np.asarray(values, np.float64)
     std = float(np.std(array, ddof=1)) if len(array) > 1 else float("nan")

@@ -62,7 +62,7 @@ QUANTITIES: dict[str, Quantity] = {
 # Of them, what says how hard a drive was.
 HARDNESS: tuple[Of, ...] = ("angular", "angular_max")
 # Of which a thesis prints no number.
-UNPRINTED = (
+FURTHER = (
     *(Quantity(f"{axis}, m", f"thesis_{axis}") for axis in "xyz"),
     *(Quantity(f"{axis}, deg", f"thesis_{axis}") for axis in RPY),
     Quantity("share of inliers", "inlier_share"),
@@ -83,11 +83,11 @@ class MapKind(Section):
     offset_m: float = Field(0.0, ge=0)
     house_m: float = Field(0.0, ge=0)
     house_deg: float = Field(0.0, ge=0)
-    perturbed: bool = False
+    is_as_simulated: bool = False
     file: str = ""
 
 
-class Printed(Section):
+class ThesisNumbers(Section):
     """Numbers of one table of a thesis, by method."""
 
     sequence: str
@@ -96,7 +96,7 @@ class Printed(Section):
     values: dict[str, float]
 
 
-class Stated(Section):
+class Claim(Section):
     """That one system does better than another, as the printed numbers of both say, drive by drive."""
 
     text: str
@@ -124,7 +124,7 @@ class ReadyComparison(Section):
     """A comparison with what a thesis prints of it.
 
     systems : settings of further systems: each on all `maps`, or where there are none on drives of which a number is printed
-    unprinted : what is said below the table of UNPRINTED; without it there is none
+    further : what is said below the table of FURTHER; without it there is none
     """
 
     summary: str
@@ -134,12 +134,12 @@ class ReadyComparison(Section):
     seeds: tuple[int, ...]
     settings: tuple[str, ...] = ()
     quick: Quick
-    recorded: OwnRecording | None = None
+    recording: OwnRecording | None = None
     maps: dict[str, MapKind] = Field(default_factory=dict)
     systems: dict[str, tuple[str, ...]] = Field(default_factory=dict)
-    printed: tuple[Printed, ...]
-    unprinted: str = ""
-    stated: tuple[Stated, ...] = ()
+    numbers: tuple[ThesisNumbers, ...]
+    further: str = ""
+    claims: tuple[Claim, ...] = ()
 
     def variants(self, settings: Sequence[str]) -> list[Variant]:
         """The methods and the further systems, these on each map, `settings` over all."""
@@ -155,9 +155,9 @@ class ReadyComparison(Section):
 
         Raises UsageError where there is none of this comparison; InputError with a sentence for each thing that is missing.
         """
-        if self.recorded is None:
+        if self.recording is None:
             raise UsageError("--data-root: what this comparison compares is not public; it simulates its drives")
-        word, missing, maps = self.recorded.sequence, [], sorted(data_root.expanduser().glob("*.osm"))
+        word, missing, maps = self.recording.sequence, [], sorted(data_root.expanduser().glob("*.osm"))
         folder = data_root / "sequences" / word
         try:
             folder = find_folder(word, data_root)
@@ -169,20 +169,20 @@ class ReadyComparison(Section):
         except InputError as error:
             missing.append(f"no place and heading at the start: {error}.")
         if len(maps) != 1:
-            fetch = f"lslam osm fetch --along {self.recorded.sequence} --data-root {data_root} --out {data_root / 'town.osm'}"
+            fetch = f"lslam osm fetch --along {self.recording.sequence} --data-root {data_root} --out {data_root / 'town.osm'}"
             missing.append(f"no map: one *.osm is wanted in {data_root}, not {len(maps)}; `{fetch}` makes it.")
         if missing:
             raise InputError("\n".join(missing))
         of_recording = {
-            "sequences": (self.recorded.sequence,),
-            "settings": self.recorded.settings,
+            "sequences": (self.recording.sequence,),
+            "settings": self.recording.settings,
             "maps": {"osm": MapKind(file=str(maps[0].absolute()))},
-            "quick": self.quick.model_copy(update={"sequences": (self.recorded.sequence,)}),
-            "printed": tuple(p.model_copy(update={"sequence": word}) for p in self.printed),
+            "quick": self.quick.model_copy(update={"sequences": (self.recording.sequence,)}),
+            "numbers": tuple(p.model_copy(update={"sequence": word}) for p in self.numbers),
         }
         return self.model_copy(update=of_recording)
 
-    def fitted(self, variants: Sequence[Variant], cell: Cell, out: Path) -> list[Variant]:
+    def variants_on(self, variants: Sequence[Variant], cell: Cell, out: Path) -> list[Variant]:
         """The variants with the map of a simulated drive, its place and heading; drift is drawn by the drive's seed."""
         if not self.maps:
             return [v for v in variants if v.name not in self.systems or self._of(cell.sequence, v.name)]
@@ -207,7 +207,7 @@ class ReadyComparison(Section):
             return cell.path / EXACT
         if errors.file:
             return Path(errors.file)
-        if errors.perturbed:
+        if errors.is_as_simulated:
             return cell.path / PERTURBED
         path = out / MAPS / f"{cell.sequence}-{cell.seed}-{kind}.osm"
         origin = _world_of(cell)[1]
@@ -222,7 +222,7 @@ class ReadyComparison(Section):
 
     def beside(self, runs: Sequence[RunScore]) -> tuple[Table, ...]:
         """The tables of numbers, of what is stated and of what is measured only, of the runs that there are."""
-        return self._numbers(runs), self._statements(runs), self._unprinted(runs)
+        return self._numbers(runs), self._statements(runs), self._further(runs)
 
     def _numbers(self, runs: Sequence[RunScore]) -> Table:
         rows = []
@@ -232,9 +232,9 @@ class ReadyComparison(Section):
             hardness = difficulty([(printed.get(of), ours[of]) for of in HARDNESS])
             limit = next((run.limit for run in runs if (run.sequence, run.method) == (sequence, method)), None)
             for of, number, source in self._of(sequence, method):
-                judged = judge_time(ours[of], limit) if of == "time" else judge_number(number, ours[of], hardness)
+                judgement = judge_time(ours[of], limit) if of == "time" else judge_number(number, ours[of], hardness)
                 theirs = (sequence, method, QUANTITIES[of].label, f"{number:g}")
-                rows.append((*theirs, _spread(ours[of]), hardness, judged.verdict, judged.why, source))
+                rows.append((*theirs, _median_and_worst(ours[of]), hardness, judgement.verdict, judgement.why, source))
         header = ("sequence", "method", "quantity", "thesis", "ours", "ours was", "verdict", "why", "source")
         recipe = (
             "ours: median / worst over seeds; reproduced: within a factor of two of a run; refuted: all runs are off to one side "
@@ -243,42 +243,46 @@ class ReadyComparison(Section):
         )
         return Table("beside the thesis, number by number", header, tuple(rows), recipe)
 
-    def _unprinted(self, runs: Sequence[RunScore]) -> Table:
+    def _further(self, runs: Sequence[RunScore]) -> Table:
         rows = [
-            (sequence, method, *(_spread(list(_values(runs, sequence, method, each).values())) for each in UNPRINTED))
+            (
+                sequence,
+                method,
+                *(_median_and_worst(list(_values(runs, sequence, method, each).values())) for each in FURTHER),
+            )
             for sequence, method in dict.fromkeys((run.sequence, run.method) for run in runs)
-            if self.unprinted
+            if self.further
         ]
-        header = ("sequence", "method", *(each.label for each in UNPRINTED))
-        return Table("of which the thesis prints no number", header, tuple(rows), self.unprinted)
+        header = ("sequence", "method", *(each.label for each in FURTHER))
+        return Table("of which the thesis prints no number", header, tuple(rows), self.further)
 
     def _of(self, sequence: str, method: str) -> list[tuple[Of, float, str]]:
         """What is printed of a method on a drive, or on the clean twin of a hard one: quantity, number, source."""
         plain, system = sequence.removesuffix(HARD), method.split(ON)[0]
-        return [(p.of, p.values[system], p.source) for p in self.printed if p.sequence == plain and system in p.values]
+        return [(p.of, p.values[system], p.source) for p in self.numbers if p.sequence == plain and system in p.values]
 
-    def _printed(self, sequence: str, method: str, of: str) -> float | None:
+    def _number(self, sequence: str, method: str, of: str) -> float | None:
         return next((value for kind, value, _ in self._of(sequence, method) if kind == of), None)
 
     def _statements(self, runs: Sequence[RunScore]) -> Table:
         rows = []
         scores = list(dict.fromkeys((run.sequence, run.method) for run in runs))
-        for stated in self.stated:
+        for claim in self.claims:
             for sequence, method in scores:
-                if method.split(ON)[0] != stated.left:
+                if method.split(ON)[0] != claim.left:
                     continue
-                kind = method.removeprefix(stated.left)
-                right = stated.right + kind if (sequence, stated.right + kind) in scores else stated.right
-                a, b = (self._printed(sequence, name, stated.of) for name in (method, right))
+                kind = method.removeprefix(claim.left)
+                right = claim.right + kind if (sequence, claim.right + kind) in scores else claim.right
+                a, b = (self._number(sequence, name, claim.of) for name in (method, right))
                 if a is None or b is None or (sequence, right) not in scores:
                     continue
-                ours, theirs = (_values(runs, sequence, name, QUANTITIES[stated.of]) for name in (method, right))
+                ours, theirs = (_values(runs, sequence, name, QUANTITIES[claim.of]) for name in (method, right))
                 pairs = [(ours[seed], theirs[seed]) for seed in ours if seed in theirs]
                 judgement = judge_order(a < b, pairs)
-                if stated.of == "time" and any(not r.is_timed_alone for r in runs if r.sequence == sequence):
+                if claim.of == "time" and any(not r.is_timed_alone for r in runs if r.sequence == sequence):
                     judgement = Judgement("undecided", f"{judgement.why}; runs shared the machine")
                 rows.append(
-                    (stated.text, sequence + kind, f"{a / b:.2f}", judgement.verdict, judgement.why, stated.source)
+                    (claim.text, sequence + kind, f"{a / b:.2f}", judgement.verdict, judgement.why, claim.source)
                 )
         header = ("the thesis", "drive", "its ratio", "verdict", "here", "source")
         recipe = (
@@ -309,7 +313,7 @@ def _values(runs: Sequence[RunScore], sequence: str, method: str, of: Quantity) 
     }
 
 
-def _spread(values: Sequence[float]) -> str:
+def _median_and_worst(values: Sequence[float]) -> str:
     return " / ".join("failed" if value == inf else significant(value) for value in median_and_worst(values))
 
 

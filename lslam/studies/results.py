@@ -42,9 +42,9 @@ NO_TRUTH = "no ground truth"
 RESULTS = "results.csv"
 PARQUET = "results.parquet"
 # Data stay read from one run to the next, so reading is no part of a run's time.
-_NOT_TIMED = ("read",)
+_WITHOUT_TIME = ("read",)
 # A run that waited longer for its core was held up by somebody.
-_MOST_WAITED = 0.05
+_LONGEST_WAIT = 0.05
 # A table of so many rows takes its time to write, and no more than one part in so many of all time.
 _MANY, _PARTS = 1000, 10
 
@@ -231,7 +231,7 @@ class Results:
         score, variant = collect_run(job), self.variants[job.method]
         state = read_state(job.state_file) or State(job.digest, score.status)
         values, scans = score.values, int(score.values.get("scans", 0))
-        stages_ms = {name: 1e3 * seconds for name, seconds in score.stages.items() if name not in _NOT_TIMED}
+        stages_ms = {name: 1e3 * seconds for name, seconds in score.stages.items() if name not in _WITHOUT_TIME}
         return StudyRow(
             run=f"{job.sequence}/{job.folder.name}",
             study=self.study,
@@ -272,4 +272,4 @@ def _seen_from(out: Path, folder: Path) -> str:
 
 def is_comparable(state: State) -> bool:
     """Whether a run's times can be compared: it had a core to itself, without other load."""
-    return state.is_alone and state.waited <= _MOST_WAITED
+    return state.is_alone and state.waited <= _LONGEST_WAIT

@@ -47,6 +47,9 @@ class State:
     machine: str = ""
 
 
+_KINDS: dict[str, Callable[[Any], Any]] = {"str": str, "int": int, "float": float, "bool": bool}
+
+
 def write_state(path: Path, state: State) -> None:
     """Write the file atomically; raises OutputError."""
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -57,17 +60,7 @@ def read_state(path: Path) -> State | None:
     """The state; None when there is none that can be read."""
     try:
         tree = parse_json(path.read_text(encoding="utf-8"))
-        return State(
-            str(tree["digest"]),
-            str(tree["status"]),
-            str(tree["reason"]),
-            int(tree["jobs"]),
-            float(tree["load"]),
-            float(tree["seconds"]),
-            bool(tree["is_alone"]),
-            float(tree["waited"]),
-            str(tree["machine"]),
-        )
+        return State(**{f.name: _KINDS[str(f.type)](tree[f.name]) for f in fields(State)})
     except (OSError, *MISFIT):
         return None
 
@@ -84,7 +77,7 @@ VERSION = 3
 SCHEMA = "study_version"
 STAGE = "stage_ms."
 # Worked out from the others, for those who read the table elsewhere.
-DERIVED = ("is_diverged", "time_per_scan_ms")
+FROM_OTHERS = ("is_diverged", "time_per_scan_ms")
 # Python takes `1_000`, `nan` and `inf` for numbers too, and no parameter has such a value: they are words.
 _NUMBER = re.compile(r"-?(0|[1-9][0-9]*)(?P<rest>(\.[0-9]+)?([eE][+-]?[0-9]+)?)")
 _PLAIN = {f.name: str(f.type) for f in fields(StudyRow) if f.name not in ("parameters", "stages_ms")}
@@ -101,7 +94,7 @@ def study_columns(rows: Sequence[StudyRow]) -> dict[str, list[Value | None]]:
         table[name] = [getattr(row, name) for row in rows]
     for name in parameters:
         table[name] = [row.parameters.get(name) for row in rows]
-    for name in (*names[place:], *DERIVED):
+    for name in (*names[place:], *FROM_OTHERS):
         table[name] = [_none_if_nan(getattr(row, name)) for row in rows]
     for name in stages:
         table[STAGE + name] = [row.stages_ms.get(name) for row in rows]

@@ -33,14 +33,13 @@ class StudyProgress:
 class Task:
     """Task for a worker.
 
-    work : called without arguments in the process, so it must be picklable; said : file for the output of the process
-
+    work : called without arguments in the process, so it must be picklable; output : file for what the process prints
     data : what it reads, empty when a process that did something before is as good as a new one
     """
 
     name: str
     work: Callable[[], object]
-    said: Path
+    output: Path
     data: str = ""
 
 
@@ -95,7 +94,7 @@ def run_tasks(
             for pipe in connection.wait([worker.pipe for worker in busy]):
                 worker = next(worker for worker in busy if worker.pipe is pipe)
                 busy.remove(worker)
-                cause = _ending(worker, tasks[worker.index].said, pool.is_persistent)
+                cause = _ending(worker, tasks[worker.index].output, pool.is_persistent)
                 if cause is None:
                     idle.append(worker)
                 if cause and tries[worker.index] < pool.tries:
@@ -111,8 +110,8 @@ def _choice(data: Sequence[str], worker: _Worker | None, workers: Sequence[_Work
     """Index of the next task: one whose data this worker has cached, else data that no worker has, else the first."""
     own = set() if worker is None else worker.has_read
     of_all = {name for other in workers for name in other.has_read}
-    wanted = (name in own for name in data), (name not in of_all for name in data)
-    return next((k for marks in wanted for k, is_wanted in enumerate(marks) if is_wanted), 0)
+    orders = (name in own for name in data), (name not in of_all for name in data)
+    return next((k for marks in orders for k, is_next in enumerate(marks) if is_next), 0)
 
 
 def _hire(pool: WorkerPool) -> _Worker:
@@ -125,7 +124,7 @@ def _hire(pool: WorkerPool) -> _Worker:
     return _Worker(process, ours)
 
 
-def _ending(worker: _Worker, said: Path, is_persistent: bool) -> str | None:
+def _ending(worker: _Worker, output: Path, is_persistent: bool) -> str | None:
     """None when the process is ready for more, else the cause of its death; empty when it ended normally."""
     try:
         worker.pipe.recv()
@@ -135,7 +134,7 @@ def _ending(worker: _Worker, said: Path, is_persistent: bool) -> str | None:
     except (EOFError, OSError):
         pass  # gone in the middle of its task
     worker.process.join()
-    cause = _cause(worker.process.exitcode, said)
+    cause = _cause(worker.process.exitcode, output)
     worker.process.close()
     worker.pipe.close()
     return cause
@@ -176,15 +175,15 @@ def _child(pipe: Connection) -> None:
 
 
 def _do(task: Task) -> None:
-    task.said.parent.mkdir(parents=True, exist_ok=True)
-    with task.said.open("wb") as stream:
+    task.output.parent.mkdir(parents=True, exist_ok=True)
+    with task.output.open("wb") as file:
         for number in (1, 2):
-            os.dup2(stream.fileno(), number)
+            os.dup2(file.fileno(), number)
     task.work()
-    for printed in (sys.stdout, sys.stderr):
-        printed.flush()
-    if not task.said.stat().st_size:
-        task.said.unlink()
+    for stream in (sys.stdout, sys.stderr):
+        stream.flush()
+    if not task.output.stat().st_size:
+        task.output.unlink()
 
 
 def _follow_parent() -> None:
@@ -195,24 +194,24 @@ def _follow_parent() -> None:
         os.kill(os.getpid(), signal.SIGTERM)
 
 
-def _cause(exit_code: int | None, said: Path) -> str:
+def _cause(exit_code: int | None, output: Path) -> str:
     """Cause of the process's death in one sentence; empty when it ended normally."""
     if exit_code in (0, None):
         return ""
     assert exit_code is not None
     if exit_code > 0:
-        return f"the process ended with exit code {exit_code}{_last_words(said)}"
+        return f"the process ended with exit code {exit_code}{_last_words(output)}"
     try:
         name = signal.Signals(-exit_code).name
     except ValueError:
         name = f"signal {-exit_code}"
     hint = " (often: out of memory)" if name == "SIGKILL" else ""
-    return f"the process was killed by {name}{hint}{_last_words(said)}"
+    return f"the process was killed by {name}{hint}{_last_words(output)}"
 
 
-def _last_words(said: Path) -> str:
+def _last_words(output: Path) -> str:
     try:
-        lines = [line.strip() for line in said.read_text(errors="replace").splitlines() if line.strip()]
+        lines = [line.strip() for line in output.read_text(errors="replace").splitlines() if line.strip()]
     except OSError:
         return ""
     return f": {lines[-1][:200]}" if lines else ""

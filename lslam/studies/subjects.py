@@ -6,7 +6,7 @@ import hashlib
 import json
 import logging
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,7 +17,8 @@ from lslam.core.config.input import AS_CONFIGURED, InputConfig, ScanRange
 from lslam.core.errors import InputError, OutputExistsError, UsageError, nearest
 from lslam.core.printable import file_safe
 from lslam.io.readers import find_folder, open_sequence
-from lslam.simulation.scenario_files import find_scenario
+from lslam.simulation.scenario_files import find_scenario, scenario_names
+from lslam.studies.runner import StudyProgress
 
 if TYPE_CHECKING:
     from lslam.simulation.scenarios import SimulatedDrive
@@ -51,13 +52,13 @@ def scene_digest(scene: Scene, seed: int) -> str:
     Raises UsageError, ConfigError or InputError for a scenario that is none.
     """
     scenario = find_scenario(scene.scenario, scene.settings)
-    said = {
+    content = {
         "scenario": scenario.model_dump(mode="json"),
         "scene": {**asdict(scene), "scenario": ""},
         "seed": seed,
         "lslam": __version__,
     }
-    return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def scene_folder(scene: Scene, seed: int, parent: Path) -> Path:
@@ -67,13 +68,7 @@ def scene_folder(scene: Scene, seed: int, parent: Path) -> Path:
     return parent / f"{scene.name}-{seed}{'' if scene.scans is None else f'-{scene.scans}'}{mark}" / "sequences" / "00"
 
 
-def simulate_once(
-    scene: Scene,
-    seed: int,
-    parent: Path,
-    on_start: Callable[[str, int], None] = lambda stage, total: None,
-    on_step: Callable[[], None] = lambda: None,
-) -> Path:
+def simulate_once(scene: Scene, seed: int, parent: Path, progress: StudyProgress | None = None) -> Path:
     """The sequence folder of the scene simulated with `seed` below `parent`; made now unless it is there already.
 
     It holds what `lslam simulate` writes by default. An interrupted simulation goes on. Raises what `simulate` and `record`
@@ -86,11 +81,12 @@ def simulate_once(
     if sequence.is_dir() and (folder / "poses" / "00.txt").is_file():
         return sequence
     drive = drive_of(scene, seed)
-    on_start(f"simulating {scene.name}, seed {seed}", len(drive))
+    progress = progress or StudyProgress()
+    progress.on_start(f"simulating {scene.name}, seed {seed}", len(drive), "scans", 1)
     try:
-        record(drive, folder, on_scan=lambda _: on_step(), resume=True)
+        record(drive, folder, on_scan=lambda _: progress.on_step(""), resume=True)
     except OutputExistsError:
-        record(drive, folder, overwrite=True, on_scan=lambda _: on_step())
+        record(drive, folder, overwrite=True, on_scan=lambda _: progress.on_step(""))
     return sequence
 
 
@@ -144,12 +140,11 @@ def find_subjects(
         if any((s.path, s.scenario) == (subject.path, subject.scenario) for s in subjects):
             raise UsageError(f"sequence {word!r} is named twice: a comparison needs it once")
         subjects.append(subject)
-    return _with_unique_labels(subjects)
+    names = unique_labels([s.label for s in subjects], [s.path for s in subjects])
+    return [replace(subject, label=name) for subject, name in zip(subjects, names, strict=True)]
 
 
 def _find(word: str, data_root: Path | None) -> Subject:
-    from lslam.simulation.scenario_files import scenario_names
-
     is_scenario = word in scenario_names()
     try:
         # Absolute, but links kept: `sequences/07` may be one, and its poses lie beside the link.
@@ -167,23 +162,18 @@ def _find(word: str, data_root: Path | None) -> Subject:
     return Subject(file_safe(open_sequence(path).name), path=path)
 
 
-def _with_unique_labels(subjects: list[Subject]) -> list[Subject]:
-    names = unique_labels([s.label for s in subjects], [s.path for s in subjects])
-    return [replace(subject, label=name) for subject, name in zip(subjects, names, strict=True)]
-
-
 def unique_labels(labels: Sequence[str], paths: Sequence[Path | None]) -> list[str]:
     """One distinct label per path of a recording; None for a simulation.
 
     Equal names are distinguished by the part of their paths in which all differ, or by a number.
     """
-    taken: dict[str, list[Path | None]] = {}
+    groups: dict[str, list[Path | None]] = {}
     for label, path in zip(labels, paths, strict=True):
-        if path not in taken.setdefault(label, []):
-            taken[label].append(path)
-    out = {(label, places[0]): label for label, places in taken.items()}
-    used_labels = set(taken)
-    for label, places in taken.items():
+        if path not in groups.setdefault(label, []):
+            groups[label].append(path)
+    out = {(label, places[0]): label for label, places in groups.items()}
+    used_labels = set(groups)
+    for label, places in groups.items():
         if len(places) < 2:
             continue
         parts = [((path and path.parts) or ("simulated",))[::-1] for path in places]
@@ -198,10 +188,10 @@ def unique_labels(labels: Sequence[str], paths: Sequence[Path | None]) -> list[s
     return [out[label, path] for label, path in zip(labels, paths, strict=True)]
 
 
-def used(scans: int, config: InputConfig) -> int:
+def scans_of_run(scans: int, config: InputConfig) -> int:
     """Number of scans of a recording that a run uses.
 
-    >>> used(20, InputConfig(start=1, skip_frames=4)), used(20, InputConfig(count=3))
+    >>> scans_of_run(20, InputConfig(start=1, skip_frames=4)), scans_of_run(20, InputConfig(count=3))
     (5, 3)
     """
     left = len(range(config.start, scans, config.skip_frames))
@@ -220,8 +210,8 @@ def check_range(name: str, own: ScanRange, scans: int) -> None:
         raise UsageError(f"sequence {name} has {scans} scans: {said} goes beyond its end")
 
 
-def scans_needed(configs: Iterable[InputConfig]) -> int | None:
+def count_scans(configs: Iterable[InputConfig]) -> int | None:
     """Scans a simulation must have for all of these `start`, `count` and `skip_frames`; None is all it has by itself."""
-    needed = [None if c.count is None else c.start + (c.count - 1) * c.skip_frames + 1 for c in configs]
-    known = [scans for scans in needed if scans is not None]
-    return max(known) if len(known) == len(needed) else None
+    counts = [None if c.count is None else c.start + (c.count - 1) * c.skip_frames + 1 for c in configs]
+    limits = [scans for scans in counts if scans is not None]
+    return max(limits) if len(limits) == len(counts) else None

@@ -126,7 +126,7 @@ def study_variants(study: StudyConfig, settings: Sequence[str] = ()) -> list[Var
     """
     common = [*_ALWAYS, *settings_of(study.config), *settings]
     found: list[Variant] = []
-    taken: set[str] = set()
+    names: set[str] = set()
     for point in study.points():
         said = ", ".join(f"{key} = {value}" for key, value in point.items())
         try:
@@ -138,10 +138,10 @@ def study_variants(study: StudyConfig, settings: Sequence[str] = ()) -> list[Var
             raise type(error)(f"study {study.name}, {said}: {what}") from None
         for variant in variants:
             values = (f"{key.partition('.')[2]}_{value}" for key, value in point.items())
-            name = free_name("-".join([variant.name, *values]), taken)
+            name = free_name("-".join([variant.name, *values]), names)
             found.append(replace(variant, name=name, without="", parameters=point))
     for variant in find_variants(study.beside, None, common, study.imu) if study.beside else []:
-        name = free_name(f"beside-{variant.name}", taken)
+        name = free_name(f"beside-{variant.name}", names)
         found.append(replace(variant, name=name, without="", is_beside=True))
     for variant in found:
         _check_metric(study, variant.config.eval.align)
@@ -157,16 +157,16 @@ def _check_metric(study: StudyConfig, align: Sequence[str]) -> None:
         )
 
 
-def free_name(name: str, taken: set[str]) -> str:
-    """The name as a folder's, with a number when one in `taken` has it; it is taken then.
+def free_name(name: str, names: set[str]) -> str:
+    """The name as a folder's, with a number when one in `names` has it; it is names then.
 
-    >>> taken = {"icp"}
-    >>> free_name("icp", taken), free_name("icp", taken)
+    >>> names = {"icp"}
+    >>> free_name("icp", names), free_name("icp", names)
     ('icp-2', 'icp-3')
     """
     plain = file_safe(name)
-    free = next(made for k in count(1) if (made := plain if k == 1 else f"{plain}-{k}") not in taken)
-    taken.add(free)
+    free = next(made for k in count(1) if (made := plain if k == 1 else f"{plain}-{k}") not in names)
+    names.add(free)
     return free
 
 

@@ -13,7 +13,7 @@ import traceback
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +30,6 @@ from lslam.core.errors import (
 from lslam.core.stopping import current, is_interrupt
 from lslam.core.types.scan import Scan
 from lslam.core.types.sequence import Sequence, SequenceView
-from lslam.io.remote import RemotePath
 from lslam.pipeline.run_folder import KEYFRAMES, LOG, MANIFEST, spool_of
 from lslam.studies.grid import Job
 from lslam.studies.results_csv import State, write_state
@@ -98,7 +97,7 @@ class SequenceCache:
         return CachedSequence(whole, self.store, number)
 
 
-def memory_bound() -> int:
+def cache_limit() -> int:
     """Bytes of scans that this process may keep."""
     try:
         free = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
@@ -173,8 +172,7 @@ def execute(job: Job, context: WorkerContext) -> None:
 
 def _keep_traceback(folder: Path, error: Exception) -> str:
     """Put it behind what the run said, in its log.txt; the end of a sentence that says so, empty when it cannot be."""
-    if isinstance(folder, RemotePath):
-        folder = spool_of(folder)
+    folder = spool_of(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with (folder / LOG).open("a", encoding="utf-8", errors="backslashreplace") as stream:
@@ -186,8 +184,7 @@ def _keep_traceback(folder: Path, error: Exception) -> str:
 
 def _drop_lone_log(folder: Path) -> None:
     """A mistake before there was a run left its traceback in a folder that is none, and so would not be replaced."""
-    if isinstance(folder, RemotePath):
-        folder = spool_of(folder)
+    folder = spool_of(folder)
     with contextlib.suppress(OSError):  # what is in the way is said when the run is made
         if not (folder / MANIFEST).exists():
             (folder / LOG).unlink(missing_ok=True)
@@ -205,11 +202,11 @@ def _waited_s() -> float:
 def _run(job: Job, is_persistent: bool) -> tuple[str, str]:
     """Status and reason of a run that came to its end."""
     from lslam.pipeline.run import run
-    from lslam.pipeline.watch import BEFORE_SCANS, RunOutcome, Watch
+    from lslam.pipeline.watch import RunOutcome, watch_run
 
     if job.refusal:
         raise InputError(job.refusal)
-    ended: list[RunOutcome] = []
+    outcomes: list[RunOutcome] = []
     config = job.config
     key = (
         job.path,
@@ -219,18 +216,12 @@ def _run(job: Job, is_persistent: bool) -> tuple[str, str]:
         config.gnss.mode != "off",
         tuple(sorted(job.reading.items())),
     )
-    sequence = _sequences().get(key, _opening(job)) if is_persistent else _opening(job)()
-    stop = current()
-
-    def be_gentle(stage: str, scans: int) -> None:
-        """Let a signal end the run after the scan in work, from the first stage of scans on."""
-        stop.is_gentle = stage not in BEFORE_SCANS
-
-    watch = Watch(be_gentle, on_end=ended.append, should_stop=stop)
+    opening = partial(_open, job)
+    sequence = _sequences().get(key, opening) if is_persistent else opening()
+    watch = watch_run(current(), on_end=outcomes.append)
 
     def make(goes_on: bool) -> None:
-        """Make the run, or resume it; a failed gate of its own does not count here."""
-        # A gate of the run's own (input.strict): it is done all the same.
+        """Make the run, or resume it; a failed gate of its own (input.strict) does not count here."""
         with contextlib.suppress(GateError):
             run(
                 sequence,
@@ -247,34 +238,22 @@ def _run(job: Job, is_persistent: bool) -> tuple[str, str]:
     # What lies there may be another run, or a finished one that left no state: it is replaced.
     with contextlib.suppress(OutputExistsError, RunFinishedError):
         make(job.goes_on)
-    if not ended:
+    if not outcomes:
         make(False)
-    manifest = ended[-1].record.manifest
+    manifest = outcomes[-1].record.manifest
     status = str(manifest["status"])
     return status, "" if status == "done" else "; ".join(manifest["problems"])  # a run that is done may have warned
 
 
-def _opening(job: Job) -> Callable[[], Sequence]:
-    from lslam.io.readers import open_sequence
+def _open(job: Job) -> Sequence:
+    from lslam.pipeline.check import open_recording
     from lslam.studies.subjects import simulate_once
 
-    def opening() -> Sequence:
-        if job.scene is not None:
-            simulate_once(job.scene, job.seed, job.path.parents[2])
-        config = job.config
-        return open_sequence(
-            job.path,
-            data_root=job.data_root,
-            vertical_correction_deg=config.input.vertical_correction_deg,
-            imu=config.imu.use,
-            gnss=config.gnss.mode != "off",
-            **job.reading,
-        )
-
-    return opening
+    if job.scene is not None:
+        simulate_once(job.scene, job.seed, job.path.parents[2])
+    return open_recording(job.path, job.config, data_root=job.data_root, **job.reading)
 
 
 @cache
 def _sequences() -> SequenceCache:
-
-    return SequenceCache(ScanStore(memory_bound()))
+    return SequenceCache(ScanStore(cache_limit()))

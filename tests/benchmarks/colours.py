@@ -21,7 +21,7 @@ from traced import Traced, run_on
 from lslam.core.config import Config, load_config
 from lslam.core.geometry import se3
 from lslam.maps.colour import GREY
-from lslam.pipeline.colour_pass import colour_map
+from lslam.pipeline.further_passes import colour_map
 from lslam.pipeline.map_pass import build_map, scan_poser
 from lslam.simulation import lidar
 from lslam.simulation.camera import COLOURS, SimulatedCamera
@@ -65,9 +65,9 @@ class FilmedDrive(Traced):
 def scored(drive: FilmedDrive, settings: tuple[str, ...]) -> Score:
     results = run_on(drive, "map.write=false", "loops.use=false").record.results
     config = load_config(settings=settings, environ={})
-    merged = build_map(drive, results, config, lambda: None, lambda: False).merged  # type: ignore[arg-type]
+    merged = build_map(drive, results, config).cloud  # type: ignore[arg-type]
     begin = time.perf_counter()
-    coloured, _ = colour_map(merged, drive, results, config, lambda: False)  # type: ignore[arg-type]
+    coloured, _ = colour_map(merged, drive, results, config)  # type: ignore[arg-type]
     spent = time.perf_counter() - begin
     points = np.concatenate([block.points for block in merged.blocks()])
     colours = coloured.colours

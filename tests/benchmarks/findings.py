@@ -17,8 +17,8 @@ from pathlib import Path
 import tables
 
 from lslam.core.types.study import StudyResult
-from lslam.studies.study_files import find_study, study_names
-from lslam.studies.sweep import report_folder
+from lslam.studies.options import find_study, study_names
+from lslam.studies.study_runs import report_folder
 
 
 def swept(study: str, seeds: list[int], folder: Path) -> list[StudyResult]:

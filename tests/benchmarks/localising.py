@@ -30,7 +30,7 @@ from lslam.core.config import load_config
 from lslam.core.geometry import se3
 from lslam.core.geometry.se3 import umeyama
 from lslam.io.formats.trajectory_files import read_trajectory
-from lslam.pipeline.prior_map_files import read_prior_map
+from lslam.pipeline.map_tiles import read_prior_map
 from lslam.simulation.record import record
 from lslam.simulation.routes import FIRST_VISIT, Visit
 from lslam.simulation.scenarios import simulate

@@ -23,7 +23,7 @@ import tables
 
 import lslam
 from lslam.core.config.config import load_config
-from lslam.pipeline.resume import open_again, read_for_graph
+from lslam.pipeline.again import open_again, read_for_graph
 from lslam.pipeline.run import run
 from lslam.simulation.record import record
 from lslam.simulation.scenarios import simulate

@@ -23,11 +23,10 @@ from pathlib import Path
 from resource import RUSAGE_CHILDREN, RUSAGE_SELF, getrusage
 
 from lslam.studies.jobs import Local
-from lslam.studies.output import OutputOptions
+from lslam.studies.options import OutputOptions, find_study
 from lslam.studies.results_csv import read_state
 from lslam.studies.runner import StudyProgress
-from lslam.studies.study_files import find_study
-from lslam.studies.sweep import Sweep, expand_study, report_folder, run_sweep
+from lslam.studies.study_runs import Sweep, expand_study, report_folder, run_sweep
 
 GAIN = 1.8
 

@@ -18,7 +18,7 @@ from typing import Any
 import tables
 
 from lslam.cli.compare import command
-from lslam.studies.output import COMPARISON
+from lslam.studies.options import COMPARISON
 from lslam.studies.ready_comparison import comparison_names
 
 MARKS = {"reproduced": " +", "refuted": " -", "undecided": ""}

@@ -33,13 +33,12 @@ def test_a_bag_of_the_sample_runs_as_the_sample_does(tmp_path: Path) -> None:
 
 
 def test_topics_are_listed_where_there_is_a_choice(tmp_path: Path) -> None:
-    from lslam.pipeline.convert import bag_messages
     from lslam.pipeline.convert.bag_writer import BagWriter
 
     scan = open_sequence(SAMPLE).scan(0)
     with BagWriter(tmp_path / "two.bag", "bag") as writer:
         for topic in ("/front", "/rear"):
-            writer.write(topic, scan.stamp_ns, bag_messages.cloud(writer.store, scan, "lidar"))
+            writer.write(topic, scan.stamp_ns, writer.messages.cloud(scan, "lidar"))
     for command in (("info",), ("run", "--dry-run"), ("convert", "--to", "kitti", "--out", tmp_path / "k")):
         done = lslam(command[0], tmp_path / "two.bag", *command[1:])
         assert done.returncode == 2

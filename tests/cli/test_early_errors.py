@@ -43,7 +43,7 @@ NOTHING = [
     (f"compare {SAMPLE} --methods icp --seeds 1,1", "different whole numbers"),
     ("batch jobs.toml --resume --overwrite", "give one of them"),
     ("simulate block --out used", "used exists already"),
-    (f"convert {SAMPLE} --to kitti --out used", "used exists already"),
+    (f"convert {SAMPLE} --to kitti --out used", "used exists"),
     ("convert nowhere --to kitti --out new", "no sequence 'nowhere'"),
     ("info nowhere", "no sequence 'nowhere'"),
     ("map nowhere", "no folder of a run"),

@@ -12,7 +12,6 @@ from calling import assert_one_sentence, lslam, strict_json
 from rosbags.highlevel import AnyReader
 
 from lslam.io.formats.bag_files import Bag, open_bag
-from lslam.pipeline.convert import bag_messages
 from lslam.pipeline.convert.bag_writer import BagWriter
 from lslam.pipeline.doctor.inspect import examine_bag
 
@@ -21,7 +20,7 @@ def other(writer: BagWriter) -> None:
     """A topic that lslam has no use for."""
     for k in range(4):
         stamp = START_NS + k * 250_000_000
-        writer.write("/rosout", stamp, bag_messages.text(writer.store, "hello"))
+        writer.write("/rosout", stamp, writer.messages.text("hello"))
 
 
 FILL = together(transforms({("lidar", "imu"): np.eye(4)}), clouds(6), imu(40), other)

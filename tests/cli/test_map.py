@@ -21,10 +21,9 @@ from lslam.core.types.gnss import Georeference
 from lslam.io.formats.point_files import read_cloud
 from lslam.io.readers import open_sequence
 from lslam.pipeline import rebuild
-from lslam.pipeline.convert import bag_messages
 from lslam.pipeline.convert.bag_writer import BagWriter
 from lslam.pipeline.map_files import georeference_note
-from lslam.pipeline.run_folder import held
+from lslam.pipeline.run_folder import lock_folder
 
 COUNT = 10
 
@@ -208,7 +207,7 @@ def test_a_disk_that_is_full_leaves_everything_as_it_was(run: Path, monkeypatch:
 
 
 def test_a_run_at_work_keeps_its_folder(run: Path) -> None:
-    with held(run):
+    with lock_folder(run):
         done = lslam("map", run, "--overwrite", "--voxel", 1.0)
     assert done.returncode == 2
     assert "in use by another run" in done.stderr
@@ -229,7 +228,7 @@ def test_the_scans_of_a_bag_are_found_by_the_topic_of_the_run(tmp_path: Path) ->
     with BagWriter(tmp_path / "two.bag", "bag") as writer:
         for topic, scans in (("/front", (0, 1, 2, 3)), ("/rear", (40, 41))):
             for scan in map(sequence.scan, scans):
-                writer.write(topic, scan.stamp_ns, bag_messages.cloud(writer.store, scan, "lidar"))
+                writer.write(topic, scan.stamp_ns, writer.messages.cloud(scan, "lidar"))
     run, out = tmp_path / "run", tmp_path / "again.ply"
     done = lslam("run", tmp_path / "two.bag", "--lidar-topic", "/front", "--out", run, "-q")
     assert done.returncode == 0, done.stderr
@@ -288,7 +287,8 @@ def test_scores_and_comparisons(run: Path, tmp_path: Path) -> None:
         (["--out", "a.ply", "--crop", "1,2,3"], 2, "x_min, x_max, y_min, y_max"),
         (["--out", "a.ply", "--format", "obj"], 2, "contradicts"),
         (["--out", "a.laz", "--crs", "EPSG:25832"], 2, "is not georeferenced"),
-        (["--out", "a.laz", "--crs", "25832"], 2, "expected EPSG and a number"),
+        (["--out", "a.laz", "--crs", "25832"], 2, "is not georeferenced"),
+        (["--out", "a.laz", "--crs", "ETRS"], 2, "expected EPSG and a number"),
         (["--out", "a.ply", "--set", "odometry.method=icp"], 2, "only keys of the map"),
         (["--out", "a.ply", "--threshold", "1"], 2, "belongs to --against"),
         (["--against", "none.ply"], 3, "none.ply does not exist"),

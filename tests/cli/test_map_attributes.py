@@ -20,8 +20,7 @@ from lslam.core.types.sequence import SequenceView
 from lslam.io.formats.ply_files import ply_columns
 from lslam.io.formats.point_files import read_cloud
 from lslam.io.readers import open_sequence
-from lslam.pipeline.map_attributes import with_attributes
-from lslam.pipeline.map_pass import build_map
+from lslam.pipeline.map_pass import build_map, with_attributes
 from lslam.registration.preprocessing.rings import RingRule
 from lslam.registration.preprocessing.views import RingView
 from lslam.simulation.scenarios import simulate
@@ -93,8 +92,8 @@ def test_classes_of_labelled_points() -> None:
         for k, (t, T) in enumerate(zip(drive.stamps_ns, drive.ground_truth.poses, strict=True))
     ]
     config = load_config(None, ["map.attributes=class,ring", "map.voxel=0"])
-    built = build_map(drive, results, config, lambda: None, lambda: False)
-    columns = [block.columns for block in built.merged.blocks()]
+    built = build_map(drive, results, config)
+    columns = [block.columns for block in built.cloud.blocks()]
     labels, rings = (np.concatenate([c[name] for c in columns]) for name in ("class", "ring"))
     assert CLASSES["moving-car"] in labels
     assert set(labels.tolist()) <= set(CLASSES.values())

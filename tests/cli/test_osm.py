@@ -76,7 +76,7 @@ def test_what_is_fetched_is_there_again_without_network(server: Any, osm: Call, 
         assert facts["ground_covered_m2"] == pytest.approx(2 * 11.12 * 7.31, rel=0.01)
         assert facts["walls_m"] == pytest.approx(2 * 2 * (11.12 + 7.31), rel=0.01)
     code, sentence = osm("fetch", "--around", PLACE)
-    assert (code, sentence) == (2, "map.osm exists: give --overwrite to replace it, or another --out")
+    assert (code, sentence) == (2, "map.osm exists; name another file with --out or replace it with --overwrite")
 
 
 def test_a_sequence_a_line_and_a_trajectory_say_where_they_are(server: Any, osm: Call, tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from calling import SAMPLE, assert_one_sentence, lslam
 import lslam as lslam_api
 from lslam.core.config import load_config
 from lslam.evaluation.metric import AbsoluteError
-from lslam.pipeline.plot_run import plotted_run
+from lslam.pipeline.again import gather_figure
 from lslam.reports.figures import draw_figure
 
 WALLS = SAMPLE / "sequences" / "00" / "map_perturbed.osm"
@@ -59,7 +59,7 @@ def T_gt_est_R(absolute: AbsoluteError) -> np.ndarray:
 
 def test_errors_are_in_the_axes_of_the_lidar(run: Path) -> None:
     """The planar error is that of x and y of the body, and no larger than the whole."""
-    plotted = plotted_run(run, "errors")
+    plotted = gather_figure(run, "errors")
     assert plotted.evaluation is not None
     planar, _ = draw_figure(plotted, "errors").axes
     ahead, left, up, both = (np.asarray(line.get_ydata()) for line in planar.get_lines())

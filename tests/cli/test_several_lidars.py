@@ -11,7 +11,6 @@ from calling import lslam, strict_json
 
 from lslam.core.geometry import se3
 from lslam.io.readers import open_sequence
-from lslam.pipeline.convert import bag_messages
 from lslam.pipeline.convert.bag_writer import BagWriter
 
 SAMPLE = Path(__file__).parents[2] / "sample_data"
@@ -24,7 +23,7 @@ def two_lidars(path: Path, topics: tuple[str, str]) -> Path:
     sequence = open_sequence(SAMPLE)
     with BagWriter(path, "mcap") as writer:
         tree = {("front", "rear"): T_FRONT_REAR}
-        writer.write("/tf_static", START_NS, bag_messages.transforms(writer.store, START_NS, tree))
+        writer.write("/tf_static", START_NS, writer.messages.transforms(START_NS, tree))
         for k in range(4):
             scan = replace(sequence.scan(k), stamp_ns=START_NS + k * 100_000_000)
             left = scan.points[:, 1] > 0
@@ -33,7 +32,7 @@ def two_lidars(path: Path, topics: tuple[str, str]) -> Path:
             for topic, frame, one in (
                 (topics[0], "front", scan.select(left)), (topics[1], "rear", replace(away, points=back)),
             ):  # fmt: skip
-                writer.write(topic, one.stamp_ns, bag_messages.cloud(writer.store, one, frame))
+                writer.write(topic, one.stamp_ns, writer.messages.cloud(one, frame))
     return path
 
 

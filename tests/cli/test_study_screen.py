@@ -14,7 +14,7 @@ import pytest
 from rich.console import Console
 
 from lslam.cli import console
-from lslam.cli.console import BestTable, TimeLeft, bars, best_so_far
+from lslam.cli.console import BestTable, RemainingTime, bars, best_so_far
 from lslam.core.types.study import StudyRow
 
 ROWS = [
@@ -72,7 +72,7 @@ def ends(durations: list[float], at_once: int) -> list[float]:
 @pytest.mark.parametrize(("total", "at_once"), [(1, 1), (5, 1), (7, 2), (8, 3), (3, 8)])
 def test_the_time_left_of_runs_that_take_as_long_is_exact(total: int, at_once: int) -> None:
     now = [0.0]
-    left = TimeLeft(total, at_once, lambda: now[0])
+    left = RemainingTime(total, at_once, lambda: now[0])
     assert left.text == ""
     made = ends([60.0] * total, at_once)
     for end in made:
@@ -85,7 +85,7 @@ def test_the_time_left_of_runs_that_take_as_long_is_exact(total: int, at_once: i
 
 def test_a_first_run_that_compiles_is_not_the_pace() -> None:
     now = [0.0]
-    left = TimeLeft(100, 1, lambda: now[0])
+    left = RemainingTime(100, 1, lambda: now[0])
     for now[0] in (40.0, 45.0, 50.0):
         left.step()
     assert (left.usual, left.seconds) == (5.0, 97 * 5.0)
@@ -95,7 +95,7 @@ def test_the_time_left_of_unlike_runs_is_never_far_off() -> None:
     """Runs of 40 to 80 s, three at once: after a third of them the estimate is within a run of the truth, and counts down."""
     now, rng = [0.0], random.Random(1)
     made = ends([rng.uniform(40, 80) for _ in range(60)], 3)
-    left = TimeLeft(60, 3, lambda: now[0])
+    left = RemainingTime(60, 3, lambda: now[0])
     for k, end in enumerate(made):
         now[0] = end
         left.step()
@@ -119,10 +119,10 @@ def test_the_first_of_many_scans_is_not_the_rate(
     assert caplog.messages[-1] == "odometry 200/200, 4.0 scans/s, 49.9 s"
 
 
-def after(durations: list[float], total: int) -> TimeLeft:
+def after(durations: list[float], total: int) -> RemainingTime:
     """The estimate after steps that took so long, one after the other."""
     now = [0.0]
-    left = TimeLeft(total, 1, lambda: now[0])
+    left = RemainingTime(total, 1, lambda: now[0])
     for duration in durations:
         now[0] += duration
         left.step()
@@ -148,7 +148,7 @@ def test_nothing_is_said_of_scans_that_were_held_back_and_come_at_once() -> None
 def test_a_plain_line_says_how_long_is_left(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
     now = [0.0]
     monkeypatch.setattr("time.monotonic", lambda: now[0])
-    monkeypatch.setattr(TimeLeft.__init__, "__defaults__", (1, lambda: now[0]))
+    monkeypatch.setattr(RemainingTime.__init__, "__defaults__", (1, lambda: now[0]))
     monkeypatch.setattr(console.log, "propagate", True)
     monkeypatch.setattr(console.log, "handlers", [])
     with caplog.at_level(logging.INFO, "lslam"), ExitStack() as stack:

@@ -22,9 +22,9 @@ from lslam.core.types.trajectory import Trajectory
 from lslam.io.formats.point_files import read_cloud
 from lslam.io.formats.trajectory_lines import write_tum
 from lslam.maps.octree import points_of
+from lslam.pipeline.again import view_run
 from lslam.pipeline.map_files import MapNote, georeference_note, write_map
-from lslam.pipeline.rebuild import viewed_run
-from lslam.pipeline.view.tiles import MapTiles
+from lslam.pipeline.view.sites import MapTiles
 from lslam.reports.figures import MOST_POINTS, by_height
 
 POINTS = np.random.default_rng(0).uniform(-50, 50, (400, 3))
@@ -47,7 +47,7 @@ def run(tmp_path: Path) -> Path:
 
 def test_all_is_shown_in_the_world_of_the_run(run: Path) -> None:
     assert np.abs(read_cloud(run / "map.laz").points).max() > 1e6
-    viewed = viewed_run(run)
+    viewed = view_run(run)
     assert viewed.cloud is not None
     np.testing.assert_allclose(viewed.cloud.points, POINTS, atol=0.001)
     assert viewed.odometry is not None
@@ -55,7 +55,7 @@ def test_all_is_shown_in_the_world_of_the_run(run: Path) -> None:
     assert viewed.name == f"drive ({run.name})"
     for path in (run / "map.laz", run / "trajectory_odometry.tum"):
         path.unlink()
-    bare = viewed_run(run)
+    bare = view_run(run)
     assert (bare.cloud, bare.odometry) == (None, None)
 
 

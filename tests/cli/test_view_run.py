@@ -25,9 +25,8 @@ from lslam.core.errors import InputError
 from lslam.core.geometry import se3
 from lslam.io.formats.trajectory_files import read_trajectory
 from lslam.io.readers import open_sequence
-from lslam.pipeline.view.page import require_one_run
 from lslam.pipeline.view.server import RunServer
-from lslam.pipeline.view.sites import ViewedSites, change_between
+from lslam.pipeline.view.sites import ViewedSites, change_between, require_one_run
 
 # Beyond the gates of loops: none closes by itself.
 DRIFT = ("--set", "debug.drift=true", "--set", "debug.drift_percent=4", "--set", "debug.drift_deg_per_100m=12")

@@ -16,7 +16,6 @@ from pcap_builders import OusterSpec, ouster, ouster_imu, velodyne
 
 from lslam.core.types.scan import Scan
 from lslam.io.formats.bag_chunks import zstd
-from lslam.pipeline.convert import bag_messages
 from lslam.pipeline.convert.bag_writer import BagWriter
 
 _METADATA = (
@@ -28,7 +27,7 @@ def _some(begin: int) -> Fill:
     def fill(writer: BagWriter) -> None:
         for k in range(begin, begin + 2):
             one = scan(k, 40)
-            writer.write("/points", one.stamp_ns, bag_messages.cloud(writer.store, one, "lidar"))
+            writer.write("/points", one.stamp_ns, writer.messages.cloud(one, "lidar"))
 
     return fill
 
@@ -76,9 +75,9 @@ def _halves(folder: Path) -> list[Files]:
             left = one.points[:, 1] > 0
             for mask in (left, ~left):
                 half = Scan(one.points[mask], one.stamp_ns, k, None, one.times[mask], None)
-                writer.write("/points", one.stamp_ns, bag_messages.cloud(writer.store, half, "lidar"))
+                writer.write("/points", one.stamp_ns, writer.messages.cloud(half, "lidar"))
             tree = {("base", "lidar"): np.eye(4), ("base", "imu"): np.eye(4)}
-            writer.write("/tf", one.stamp_ns, bag_messages.transforms(writer.store, START_NS + k * STEP_NS, tree))
+            writer.write("/tf", one.stamp_ns, writer.messages.transforms(START_NS + k * STEP_NS, tree))
 
     return [{"a.bag": bag(folder / "a.bag", together(fill, imu(8))).read_bytes()}]
 

@@ -16,8 +16,7 @@ from lslam.core.errors import InputError
 from lslam.core.geometry import se3
 from lslam.io.formats.bag_files import INFO_TOPIC
 from lslam.io.readers import open_sequence
-from lslam.pipeline.convert import bag_messages
-from lslam.pipeline.convert.bag_writer import BagWriter
+from lslam.pipeline.convert.bag_writer import BagMessages, BagWriter
 
 _SCANS = 3
 
@@ -40,9 +39,9 @@ def _beside(writer: BagWriter) -> None:
     pose = se3.make(np.eye(3), np.array([1.0, 2.0, 3.0]))
     for k in range(3):
         stamp = 1_700_000_000_123_456_789 + k * 100_000_000
-        writer.write("/fix", stamp, bag_messages.fix(writer.store, stamp, np.array([49.0, 8.4, 110.0]), 0.5, "gnss"))
-        writer.write("/odom", stamp, bag_messages.odometry(writer.store, stamp, pose, "world", "lidar"))
-    writer.write(INFO_TOPIC, 1_700_000_000_000_000_000, bag_messages.text(writer.store, 'name = "a"\nrings = 4\n'))
+        writer.write("/fix", stamp, writer.messages.fix(stamp, np.array([49.0, 8.4, 110.0]), 0.5, "gnss"))
+        writer.write("/odom", stamp, writer.messages.odometry(stamp, pose, "world", "lidar"))
+    writer.write(INFO_TOPIC, 1_700_000_000_000_000_000, writer.messages.text('name = "a"\nrings = 4\n'))
 
 
 def _bag(suffix: str, kind: str, is_zstd: bool) -> Callable[[Path], list[Files]]:
@@ -73,7 +72,7 @@ def _packed_bag(compression: str) -> Callable[[Path], list[Files]]:
 
             for k in range(_SCANS):
                 one = scan(k, 40)
-                message = bag_messages.cloud(store, one, "lidar")
+                message = BagMessages(store).cloud(one, "lidar")
                 writer.write(connection, one.stamp_ns, bytes(store.serialize_ros1(message, kind)))
         return [{"a.bag": path.read_bytes()}]
 

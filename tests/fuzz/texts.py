@@ -30,7 +30,8 @@ from lslam.io.readers.scan_stamps import stamps_in_names
 from lslam.osm.bounds import Bounds
 from lslam.osm.buildings_geojson import read_buildings_geojson
 from lslam.osm.overpass import kept_reply
-from lslam.pipeline.rebuild import map_of, read_run, viewed_run
+from lslam.pipeline.again import view_run
+from lslam.pipeline.rebuild import map_of, read_run
 from lslam.pipeline.resume import may_go_on
 from lslam.simulation.osm_extract import read_perturbation
 from lslam.simulation.record import read_mark
@@ -206,7 +207,7 @@ def _read_run(folder: Path) -> None:
     """What `map`, `view`, `eval` and `--resume` read of a run folder, each for itself."""
     refused: list[LslamError] = []
     steps: list[Callable[[], object]] = [
-        lambda: read_run(folder), lambda: map_of(folder), lambda: viewed_run(folder),
+        lambda: read_run(folder), lambda: map_of(folder), lambda: view_run(folder),
         lambda: may_go_on(folder, _IDENTITY, load_config()), lambda: read_timing(folder / "timing.csv"),
     ]  # fmt: skip
     for step in steps:

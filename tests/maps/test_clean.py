@@ -231,10 +231,10 @@ def test_a_map_is_cleaned_when_asked() -> None:
     results = [ScanResult(k, int(t), T) for k, (t, T) in enumerate(zip(gt.stamps_ns, gt.poses, strict=True))]
     maps = []
     for settings in ((), ("map.clean=true",)):
-        built = build_map(drive, results, load_config(None, settings), lambda: None, lambda: False)
+        built = build_map(drive, results, load_config(None, settings))
         assert built is not None
         maps.append(built)
     plain, cleaned = maps
-    assert plain.done == ()
-    assert cleaned.done[0].startswith("cleaned: ")
-    assert 0.8 * len(plain.merged) < len(cleaned.merged) < len(plain.merged)
+    assert plain.steps == ()
+    assert cleaned.steps[0].startswith("cleaned: ")
+    assert 0.8 * len(plain.cloud) < len(cleaned.cloud) < len(plain.cloud)

@@ -21,7 +21,7 @@ from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
 from lslam.core.types.trajectory import Keyframe
 from lslam.osm.walls import find_walls
-from lslam.pipeline.resume import open_again, read_for_graph
+from lslam.pipeline.again import open_again, read_for_graph
 from lslam.pipeline.run import run
 from lslam.pipeline.watch import RunOutcome
 

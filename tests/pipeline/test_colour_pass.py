@@ -12,7 +12,7 @@ from lslam.core.errors import InputError
 from lslam.core.geometry import se3, so3
 from lslam.core.types.scan_result import ScanResult, Status
 from lslam.maps.colour import GREY
-from lslam.pipeline.colour_pass import build_finished_map, motion_of
+from lslam.pipeline.further_passes import build_finished_map, motion_of
 from lslam.simulation.camera import COLOURS, CameraModel, SimulatedCamera
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 
@@ -38,14 +38,14 @@ def results_of(drive: SimulatedDrive, bridged: tuple[int, ...] = ()) -> list[Sca
 
 
 def built(drive: SimulatedDrive, bridged: tuple[int, ...] = (), spool: Path | None = None):  # type: ignore[no-untyped-def]
-    return build_finished_map(drive, results_of(drive, bridged), CONFIG, lambda: None, lambda: False, spool)
+    return build_finished_map(drive, results_of(drive, bridged), CONFIG, spool=spool)
 
 
 def test_most_points_have_the_colour_of_the_nearest_surface_of_the_scene(drive: SimulatedDrive) -> None:
     made = built(drive)
-    points = np.concatenate([block.points for block in made.merged.blocks()])
+    points = np.concatenate([block.points for block in made.cloud.blocks()])
     colours = np.concatenate(
-        [np.stack([b.columns[c] for c in ("red", "green", "blue")], 1) for b in made.merged.blocks()]
+        [np.stack([b.columns[c] for c in ("red", "green", "blue")], 1) for b in made.cloud.blocks()]
     )
     seen = np.flatnonzero(~(colours == GREY).all(1))
     assert made.colour is not None
@@ -68,7 +68,7 @@ def test_images_beside_a_bridged_scan_are_left_out_and_counted(drive: SimulatedD
     made = built(drive, bridged=(3,))
     assert made.colour is not None
     assert (made.colour.images, made.colour.outside) == (5, 2)
-    assert "2 without a registered scan before and after left out" in made.done[-1]
+    assert "2 without a registered scan before and after left out" in made.steps[-1]
     with pytest.raises(InputError, match="no image of block-0 can colour its map: 7 are not between registered scans"):
         built(drive, bridged=(1, 3, 5, 7))
 
@@ -92,11 +92,11 @@ def test_an_image_that_cannot_be_read_is_counted_and_the_rest_is_used(
 
 def test_points_and_intensities_are_those_of_the_map_without_colours(drive: SimulatedDrive, tmp_path: Path) -> None:
     plain = load_config(settings=["map.voxel=0.2"], environ={})
-    without = build_finished_map(drive, results_of(drive), plain, lambda: None, lambda: False)
+    without = build_finished_map(drive, results_of(drive), plain)
     made = built(drive, spool=tmp_path)
-    assert (made.merged.cloud.points == without.merged.points).all()  # type: ignore[attr-defined]
+    assert (made.cloud.cloud.points == without.cloud.points).all()  # type: ignore[attr-defined]
     assert without.colour is None
-    assert not next(iter(without.merged.blocks())).columns
+    assert not next(iter(without.cloud.blocks())).columns
     assert list(tmp_path.iterdir()) == []
 
 

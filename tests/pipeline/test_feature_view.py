@@ -15,7 +15,7 @@ from lslam.core.types.scan_result import ScanResult
 from lslam.odometry import create_odometry
 from lslam.odometry.base import FeatureSource
 from lslam.odometry.frontend.register_scans import estimate
-from lslam.pipeline.feature_map_pass import MOST_SCANS, view_features
+from lslam.pipeline.further_passes import MOST_SCANS, view_features
 from lslam.pipeline.run import run
 from lslam.reports.page_data import feature_figures
 

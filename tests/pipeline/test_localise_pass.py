@@ -19,9 +19,8 @@ from lslam.core.errors import InputError, InterruptedRunError, RunFailedError
 from lslam.core.geometry import se3
 from lslam.core.types.cloud import ArrayCloud
 from lslam.io.formats.point_files import read_cloud, write_cloud
-from lslam.pipeline.localise_pass import Reanchoring
-from lslam.pipeline.prior_map_files import read_prior_map
-from lslam.pipeline.prior_map_view import spread_out
+from lslam.pipeline.localise_pass import Reanchoring, spread_out
+from lslam.pipeline.map_tiles import read_prior_map
 from lslam.pipeline.watch import Watch
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_data" / "sequences" / "00"

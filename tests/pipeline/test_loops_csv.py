@@ -26,7 +26,7 @@ def test_rows_say_what_became_of_each_candidate(tmp_path: Path) -> None:
     write_loops(tmp_path / "loops.csv", candidates, SCANS)
     with (tmp_path / "loops.csv").open(newline="") as stream:
         rows = list(csv.DictReader(stream))
-    assert tuple(rows[0]) == LOOP_COLUMNS
+    assert ",".join(rows[0]) == LOOP_COLUMNS
     assert rows[0]["scan_b"] == "9"
     assert rows[0]["verdict"] == "accepted"
     assert float(rows[0]["descriptor_distance"]) == 0.125
@@ -38,7 +38,7 @@ def test_rows_say_what_became_of_each_candidate(tmp_path: Path) -> None:
 
 def test_without_candidates_there_is_a_header(tmp_path: Path) -> None:
     write_loops(tmp_path / "loops.csv", [], [])
-    assert (tmp_path / "loops.csv").read_text() == ",".join(LOOP_COLUMNS) + "\n"
+    assert (tmp_path / "loops.csv").read_text() == LOOP_COLUMNS + "\n"
 
 
 def test_names_a_file_that_cannot_be_written(tmp_path: Path) -> None:

@@ -23,9 +23,9 @@ from lslam.core.types.sequence import Sequence, select
 from lslam.io.readers import open_sequence
 from lslam.odometry.integrity.monitor import IntegrityMonitor
 from lslam.pipeline import job
-from lslam.pipeline.lost_scans import MOST_SAID, mark_lost, mark_lost_finally
 from lslam.pipeline.manifest import Manifest
 from lslam.pipeline.run import run
+from lslam.pipeline.segments import MAX_SENTENCES, raise_alerts, raise_final_alerts
 from lslam.pipeline.watch import RunOutcome, Watch
 from lslam.reports.text import summary
 from lslam.simulation.lidar_models import LIDARS
@@ -195,7 +195,7 @@ def test_a_good_drive_raises_no_alert(scenario: str, lidar: str) -> None:
 @pytest.mark.parametrize("more", [0, 1, 3])
 def test_the_first_alerts_are_listed_and_the_others_counted(more: int) -> None:
     """One check in six finds the sensor a metre ahead: the scans of each are marked, also of those that are not told."""
-    stretches = MOST_SAID + more
+    stretches = MAX_SENTENCES + more
     cfg = config()
     monitor = IntegrityMonitor(cfg.preprocess)
     for k in range(6 * stretches):
@@ -207,13 +207,13 @@ def test_the_first_alerts_are_listed_and_the_others_counted(more: int) -> None:
     count = 30 * stretches + 1
     results = [ScanResult(100 + k, 100_000_000 * k, np.eye(4)) for k in range(count)]
     manifest = Manifest("run", drive("street"), cfg)
-    marked = mark_lost(results, monitor.checks, manifest)
+    marked = raise_alerts(results, monitor.checks, manifest)
     assert [k for k in range(count) if marked[k].may_be_elsewhere] == [k for k in range(1, count) if (k - 1) % 30 >= 25]
     assert manifest.integrity == {"checks": 6 * stretches, "conclusive": 6 * stretches, "alerts": stretches}
-    told = [problem.split(" may be")[0] for problem in manifest.problems[:MOST_SAID]]
-    assert told == [f"scans {126 + 30 * k} to {130 + 30 * k}" for k in range(MOST_SAID)]
+    told = [problem.split(" may be")[0] for problem in manifest.problems[:MAX_SENTENCES]]
+    assert told == [f"scans {126 + 30 * k} to {130 + 30 * k}" for k in range(MAX_SENTENCES)]
     said = [f"and {more} more stretches of scans that may be lost: see scans.csv"] if more else []
-    assert manifest.problems[MOST_SAID:] == said
+    assert manifest.problems[MAX_SENTENCES:] == said
 
 
 @pytest.mark.parametrize("ahead_m", [0.0, 0.02, 1.2])
@@ -231,8 +231,8 @@ def test_final_poses_are_held_against_the_same_checks(ahead_m: float) -> None:
         T[0, 3] += ahead_m * np.clip((k - 45) / 5, 0, 1)
         final.append(ScanResult(200 + k, 100_000_000 * k, T))
     manifest = Manifest("run", drive("street"), config())
-    assert not any(r.may_be_elsewhere for r in mark_lost(odometry, checks, manifest))
-    marked = mark_lost_finally(final, checks, manifest, "the pose graph")
+    assert not any(r.may_be_elsewhere for r in raise_alerts(odometry, checks, manifest))
+    marked = raise_final_alerts(final, checks, manifest, "the pose graph")
     is_wrong = ahead_m > 1
     assert [k for k in range(101) if marked[k].may_be_elsewhere] == (list(range(46, 51)) if is_wrong else [])
     assert manifest.integrity == {"checks": 20, "conclusive": 20, "alerts": 0, "final_alerts": int(is_wrong)}

@@ -55,7 +55,7 @@ def test_problems_name_the_first_bad_scan_by_its_number_in_the_recording() -> No
 
 def test_the_document_is_plain_and_strict_json() -> None:
     manifest = judged(2, False, "ok", "ok")
-    with manifest.timed("map_s"), manifest.timed("map_s"):
+    with manifest.time("map_s"), manifest.time("map_s"):
         pass
     document = json.loads(json.dumps(manifest.as_dict("done"), allow_nan=False))
     assert (document["schema"], document["status"], document["command"]) == (1, "done", "lslam run x")

@@ -30,9 +30,9 @@ def test_settings_of_the_map_reach_it() -> None:
     ]
 
     def points(*settings: str) -> np.ndarray:
-        built = build_map(drive, results, load_config(None, settings), lambda: None, lambda: False)
+        built = build_map(drive, results, load_config(None, settings))
         assert built is not None
-        return in_memory(built.merged).points
+        return in_memory(built.cloud).points
 
     whole = points("map.range_max=30")
     cropped = points("map.range_max=30", "map.crop=[-3.0, 9.0, 0.0, 50.0]")

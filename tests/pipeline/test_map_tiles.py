@@ -44,7 +44,7 @@ def test_each_point_lies_in_its_tile_and_in_no_other(suffix: str, tmp_path: Path
 
 
 def test_tiles_keep_the_colours_of_their_points(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(map_tiles, "BUFFERED", 1000)
+    monkeypatch.setattr(map_tiles, "MOST_WAITING", 1000)
     colours = np.random.default_rng(5).integers(0, 256, (5000, 3)).astype(np.uint8)
     index = write_tiles(tmp_path, ColouredCloud(CLOUD, colours), NOTE, 25.0, "ply")
     for tile in index["tiles"]:
@@ -65,7 +65,7 @@ def test_few_points_in_memory_give_the_same_tiles(tmp_path: Path, monkeypatch: p
     (one := tmp_path / "one").mkdir()
     (many := tmp_path / "many").mkdir()
     write_tiles(one, CLOUD, NOTE, 20.0, "ply")
-    monkeypatch.setattr(map_tiles, "BUFFERED", 100)
+    monkeypatch.setattr(map_tiles, "MOST_WAITING", 100)
     monkeypatch.setattr("lslam.core.types.cloud.BLOCK", 64)
     write_tiles(many, CLOUD, NOTE, 20.0, "ply")
     assert sorted(p.name for p in one.iterdir()) == sorted(p.name for p in many.iterdir())

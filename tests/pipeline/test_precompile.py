@@ -33,7 +33,7 @@ def test_it_compiles_nothing_that_the_run_does_not_need() -> None:
     precompile.load_kernels(config, [create_odometry(config)])
     precompile.load_parts(config, precompile.KERNELS)
     of_run = signatures()
-    precompile.compile_ahead(config, [name for name, part in precompile.KERNELS.items() if part.is_called(config)])
+    precompile.compile_ahead(config, [name for name, part in precompile.KERNELS.items() if part.applies(config)])
     assert signatures() == of_run
 
 
@@ -91,7 +91,7 @@ def started(monkeypatch: pytest.MonkeyPatch) -> list[subprocess.Popen[bytes]]:
 
 
 def test_it_starts_once_and_ends_with_the_block(started: list[subprocess.Popen[bytes]]) -> None:
-    with precompile.helped():
+    with precompile.helper_process():
         assert not started
         precompile.start_helper(Config())
         precompile.start_helper(Config())
@@ -101,7 +101,7 @@ def test_it_starts_once_and_ends_with_the_block(started: list[subprocess.Popen[b
 
 def test_it_ends_when_the_first_process_is_interrupted(started: list[subprocess.Popen[bytes]]) -> None:
     def interrupted() -> None:
-        with precompile.helped():
+        with precompile.helper_process():
             precompile.start_helper(Config())
             raise KeyboardInterrupt
 
@@ -114,7 +114,7 @@ def test_a_single_core_has_no_second_process(
     started: list[subprocess.Popen[bytes]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(precompile, "available_cores", lambda: 1)
-    with precompile.helped():
+    with precompile.helper_process():
         precompile.start_helper(Config())
     assert not started
 
@@ -125,5 +125,5 @@ def test_a_process_that_cannot_be_started_is_done_without(monkeypatch: pytest.Mo
 
     monkeypatch.setattr(subprocess, "Popen", refuse)
     monkeypatch.setattr(precompile, "available_cores", lambda: 2)
-    with precompile.helped():
+    with precompile.helper_process():
         precompile.start_helper(Config())

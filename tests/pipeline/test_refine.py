@@ -17,8 +17,8 @@ from lslam.core.errors import InterruptedRunError
 from lslam.core.geometry import geodesy
 from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.sequence import Sequence
-from lslam.pipeline import refine_pass
-from lslam.pipeline.refine_pass import thinner_windows
+from lslam.pipeline import back_end_pass
+from lslam.pipeline.back_end_pass import thinner_windows
 from lslam.pipeline.watch import RunOutcome, Watch
 from lslam.reports.text import summary
 from lslam.simulation.scenarios import ORIGIN, simulate
@@ -113,11 +113,11 @@ def test_poses_in_frames_of_their_own_stay(monkeypatch: pytest.MonkeyPatch) -> N
     nodes, better = np.array([0, 1, 4, 5]), poses.copy()
     better[:, 1, 3] = 0.1 * np.arange(6)
     monkeypatch.setattr(
-        refine_pass, "adjust", lambda before, swept, used, prior, numbers: Adjustment(better[nodes], swept.points, 1)
+        back_end_pass, "adjust", lambda before, swept, used, prior, numbers: Adjustment(better[nodes], swept.points, 1)
     )
-    monkeypatch.setattr(refine_pass, "thinner_windows", lambda gain, scans, cells, count: np.ones(count, bool))
+    monkeypatch.setattr(back_end_pass, "thinner_windows", lambda gain, scans, cells, count: np.ones(count, bool))
     swept = SweptPoints(np.random.default_rng(0).random((4000, 3)) * 4, np.zeros(4000, np.int64), np.zeros(4000))
-    facts, moved = refine_pass._adjustment(results, nodes, swept, None, np.zeros(0, np.int64))
+    facts, moved = back_end_pass._adjustment(results, nodes, swept, None, np.zeros(0, np.int64))
     assert moved is not None
     assert facts["scans"] == 4
     np.testing.assert_array_equal(moved[2].T_world_lidar, poses[2])

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from lslam.core.errors import InputError
-from lslam.pipeline.view.page import page_of, require_page
+from lslam.pipeline.view.sites import page_of, require_page
 from lslam.reports.shell import RUN, policy, script_of, template
 
 

@@ -14,12 +14,11 @@ from lslam.core.config.study import BatchConfig, parse_batch
 from lslam.core.types.study import StudyRow
 from lslam.io.remote import RemotePath
 from lslam.pipeline.run_folder import spool_of
-from lslam.studies.batch import expand_batch, expand_lines, listed_line
-from lslam.studies.cluster import connected
-from lslam.studies.expanded_study import make_runs
-from lslam.studies.jobs import finished, said_file
-from lslam.studies.output import OutputOptions
+from lslam.studies.cluster import connect
+from lslam.studies.jobs import folders_of_finished, make_runs, output_file
+from lslam.studies.options import OutputOptions
 from lslam.studies.results_csv import read_state, read_study_csv
+from lslam.studies.study_runs import expand_batch, expand_lines, listed_line
 
 
 @pytest.fixture
@@ -44,7 +43,7 @@ def made(bucket: RemotePath, resume: bool = False) -> list[StudyRow]:
         LocalCluster(
             n_workers=1, threads_per_worker=1, processes=False, protocol="tcp", dashboard_address=None, silence_logs=50
         ) as net,
-        connected(net.scheduler_address, None, "runs", is_persistent=False) as engine,
+        connect(net.scheduler_address, None, "runs", is_persistent=False) as engine,
     ):
         return make_runs(expand_batch(batch_of(bucket), output), output, engine)
 
@@ -75,7 +74,7 @@ def test_runs_go_to_storage_and_those_with_a_manifest_there_are_kept(bucket: Rem
     # An upload that was broken off.
     (results / "runs" / "drive8" / "icp-s0" / "manifest.json").unlink()
     jobs = expand_batch(batch_of(bucket), OutputOptions(results)).jobs
-    assert finished(jobs) == {jobs[0].folder}
+    assert folders_of_finished(jobs) == {jobs[0].folder}
     Counted.put.clear()
     again = made(bucket, resume=True)
     assert [row.status for row in again] == ["done", "done"]
@@ -85,9 +84,9 @@ def test_runs_go_to_storage_and_those_with_a_manifest_there_are_kept(bucket: Rem
 def test_a_line_may_have_its_folder_there_and_the_table_here(bucket: RemotePath, tmp_path: Path) -> None:
     config = expand_batch(batch_of(bucket), OutputOptions(bucket / "results")).jobs[0].config
     lines = [
-        listed_line(f"{name} --out", bucket / "fleet" / name, config, bucket / "results" / name, {})
+        listed_line(f"{name} --out", bucket / "fleet" / name, config, bucket / "results" / name)
         for name in ("drive7", "drive8")
     ]
     jobs = expand_lines(lines, OutputOptions(tmp_path / "out")).jobs
     assert [str(job.folder) for job in jobs] == [f"{bucket}/results/{name}" for name in ("drive7", "drive8")]
-    assert said_file(jobs[0].folder).parent == spool_of(bucket / "x").parent, "what its process prints is a file here"
+    assert output_file(jobs[0].folder).parent == spool_of(bucket / "x").parent, "what its process prints is a file here"

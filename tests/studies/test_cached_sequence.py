@@ -12,10 +12,10 @@ from lslam.core.config.config import load_config
 from lslam.core.types.scan import Scan
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 from lslam.studies.grid import Job
-from lslam.studies.jobs import run_jobs
+from lslam.studies.jobs import Local
 from lslam.studies.results_csv import read_state
-from lslam.studies.runner import StudyProgress, Task, WorkerPool
-from lslam.studies.worker import ScanStore, SequenceCache, memory_bound, size_of
+from lslam.studies.runner import StudyProgress, Task
+from lslam.studies.worker import ScanStore, SequenceCache, cache_limit, size_of
 
 pytestmark = pytest.mark.usefixtures("forked_runs")
 SHARES_TOWNS = False  # what is asked is who traces a scan
@@ -89,7 +89,7 @@ def test_cached_sequences_are_distinguished_by_their_options(tmp_path: Path) -> 
         Job("sample", "icp", k, path, config, tmp_path / str(k), str(k), "", reading=reading)
         for k, reading in enumerate([{}, {"lidar_topic": "/points"}])
     ]
-    run_jobs(jobs, WorkerPool(1, is_persistent=True), StudyProgress())
+    Local().run(jobs, StudyProgress())
     states = [read_state(job.state_file) for job in jobs]
     assert states[0] is not None
     assert states[1] is not None
@@ -110,15 +110,16 @@ def test_several_at_once_begin_with_what_takes_longest_and_one_keeps_the_order(
         begun[:] = tasks
 
     monkeypatch.setattr("lslam.studies.jobs.run_tasks", fake)
-    for pool, order in (
-        (WorkerPool(2, is_persistent=True), "3201"),
-        (WorkerPool(2), "3201"),
-        (WorkerPool(1, is_persistent=True), "0123"),
+    monkeypatch.setattr("os.cpu_count", lambda: 2)
+    for engine, order in (
+        (Local(2), "3201"),
+        (Local(2, is_persistent=False), "3201"),
+        (Local(1), "0123"),
     ):
-        run_jobs(jobs, pool, StudyProgress())
+        engine.run(jobs, StudyProgress())
         assert [task.name for task in begun] == [f"sample {k} seed 0" for k in order]
-        assert {task.data for task in begun} == {str(tmp_path) if pool.is_persistent else ""}
+        assert {task.data for task in begun} == {str(tmp_path) if engine.is_persistent else ""}
 
 
 def test_memory_is_bounded_by_what_is_free() -> None:
-    assert 0 < memory_bound() <= 2 * 10**9
+    assert 0 < cache_limit() <= 2 * 10**9

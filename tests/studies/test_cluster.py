@@ -19,12 +19,12 @@ from lslam.core.config.study import parse_study
 from lslam.core.errors import InputError, RunFailedError, UsageError
 from lslam.core.types.study import StudyRow
 from lslam.studies import cluster
-from lslam.studies.cluster import Cluster, connected, pack, unpack
+from lslam.studies.cluster import Cluster, connect, pack, unpack
 from lslam.studies.grid import Job
-from lslam.studies.output import OutputOptions
+from lslam.studies.options import OutputOptions
 from lslam.studies.results_csv import State, read_state, read_study_csv, write_state
 from lslam.studies.runner import StudyProgress
-from lslam.studies.sweep import Sweep, expand_study, run_sweep
+from lslam.studies.study_runs import Sweep, expand_study, run_sweep
 from lslam.studies.worker import WorkerContext
 
 TREE = {
@@ -58,7 +58,7 @@ def test_a_worker_killed_in_the_middle_loses_nothing_and_counts_nothing_twice(
         if len(rows) == 1:
             os.kill(victim, signal.SIGKILL)
 
-    with connected(workers.scheduler_address, None, "studying") as engine:
+    with connect(workers.scheduler_address, None, "studying") as engine:
         assert engine.at_once == 2
         rows = run_sweep(sweep, engine, StudyProgress(on_step=steps.append), kill_one)  # type: ignore[arg-type]
     assert len(steps) == len(set(steps)) == 6
@@ -73,7 +73,7 @@ def test_a_worker_killed_in_the_middle_loses_nothing_and_counts_nothing_twice(
 
 def test_workers_without_the_recording_are_named(workers: LocalCluster, tmp_path: Path) -> None:
     with (
-        connected(workers.scheduler_address, None, "studying") as engine,
+        connect(workers.scheduler_address, None, "studying") as engine,
         pytest.raises(InputError, match=r"worker tcp://.* does not have /nowhere/00: the recordings must lie there"),
     ):
         engine.prepare([job(tmp_path)], StudyProgress())
@@ -84,7 +84,7 @@ def test_workers_of_another_version_are_named(
 ) -> None:
     monkeypatch.setattr(cluster, "__version__", "9.9")
     with (
-        connected(workers.scheduler_address, None, "studying") as engine,
+        connect(workers.scheduler_address, None, "studying") as engine,
         pytest.raises(InputError, match=r"worker tcp://.* has lslam .*, this is 9\.9: install the same"),
     ):
         engine.prepare([job(tmp_path)], StudyProgress())
@@ -98,7 +98,7 @@ def test_workers_without_lslam_are_named(
 
     monkeypatch.setattr(cluster, "_inspect", fail)
     with (
-        connected(workers.scheduler_address, None, "studying") as engine,
+        connect(workers.scheduler_address, None, "studying") as engine,
         pytest.raises(InputError, match=r"worker tcp://.* cannot run lslam: No module named 'lslam'; install it there"),
     ):
         engine.prepare([job(tmp_path)], StudyProgress())
@@ -108,7 +108,7 @@ def test_a_scheduler_without_workers_is_an_error(tmp_path: Path, monkeypatch: py
     monkeypatch.setattr(cluster, "_WORKERS_S", 1)
     with (
         LocalCluster(n_workers=0, threads_per_worker=1, dashboard_address=None, silence_logs=50) as empty,
-        connected(empty.scheduler_address, None, "studying") as engine,
+        connect(empty.scheduler_address, None, "studying") as engine,
         pytest.raises(RunFailedError, match=r"has no workers: start some, `dask worker tcp://"),
     ):
         engine.prepare([job(tmp_path)], StudyProgress())
@@ -119,14 +119,14 @@ def test_an_unreachable_scheduler_is_an_error(monkeypatch: pytest.MonkeyPatch) -
     for address in ("tcp://127.0.0.1:9", "nonsense://there"):
         with (
             pytest.raises(InputError, match=f"the scheduler {address} does not answer within 1 s"),
-            connected(address, None, "studying"),
+            connect(address, None, "studying"),
         ):
             pass
 
 
 def test_the_error_about_missing_dask_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(UsageError, match=r"pip install .*\[cluster\]"), connected("tcp://127.0.0.1:9", None, ""):
+    with pytest.raises(UsageError, match=r"pip install .*\[cluster\]"), connect("tcp://127.0.0.1:9", None, ""):
         pass
 
 
@@ -198,7 +198,7 @@ def test_a_scheduler_that_is_restarted_gets_the_runs_that_are_left(
     address = start(0)
     port = int(address.rpartition(":")[2])
     try:
-        with connected(address, None, "studying") as engine:
+        with connect(address, None, "studying") as engine:
             engine.run(jobs, StudyProgress(), on_done)
     finally:
         nets[-1].close()
@@ -230,7 +230,7 @@ def test_workers_keep_data_between_runs_when_the_study_asks_for_it(
     def there(*words: object, is_persistent: bool) -> Iterator[Cluster]:
         yield Cluster(client, "tcp://there:1", "", is_persistent=is_persistent)
 
-    monkeypatch.setattr(cluster, "connected", there)
+    monkeypatch.setattr(cluster, "connect", there)
     run = job(tmp_path)
     with engine_of({"jobs": None, "scheduler": "tcp://there:1", "cluster": None}, "", is_persistent) as engine:
         engine.run([run], StudyProgress(), lambda job: None)
@@ -254,7 +254,7 @@ def test_a_run_that_comes_home_replaces_what_was_there(tmp_path: Path) -> None:
 def test_workers_of_this_machine_read_what_is_simulated_here(tmp_path: Path) -> None:
     sweep = Sweep(parse_study(TREE, "tiny", "tiny"), OutputOptions(tmp_path / "out"))
     scenes: list[str] = []
-    with connected(None, "local:1", "studying") as engine:
+    with connect(None, "local:1", "studying") as engine:
         assert engine.at_once == 1
         jobs = expand_study(sweep).jobs
         engine.prepare(jobs, StudyProgress(on_step=scenes.append))

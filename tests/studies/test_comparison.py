@@ -26,12 +26,12 @@ from lslam.io.readers import open_sequence
 from lslam.pipeline.watch import Watch
 from lslam.simulation.record import record
 from lslam.simulation.scenarios import simulate
-from lslam.studies.compare import _in_own_world, _in_world_of_truth, compare
+from lslam.studies.compare import Plan, _in_own_world, _in_world_of_truth, check_plan, run_comparison
 from lslam.studies.grid import Job
-from lslam.studies.jobs import finished, run_jobs
-from lslam.studies.plan import Plan, check_plan
+from lslam.studies.jobs import Local, folders_of_finished
+from lslam.studies.options import OutputOptions
 from lslam.studies.results_csv import read_state
-from lslam.studies.runner import StudyProgress, WorkerPool
+from lslam.studies.runner import StudyProgress
 from lslam.studies.subjects import Subject
 from lslam.studies.variants import find_variants
 from lslam.studies.worker import WorkerContext
@@ -59,12 +59,13 @@ def subjects(tmp_path_factory: pytest.TempPathFactory) -> tuple[Subject, ...]:
 @pytest.fixture(scope="module")
 def plan(subjects: tuple[Subject, ...], tmp_path_factory: pytest.TempPathFactory) -> Plan:
     out = tmp_path_factory.mktemp("comparison") / "out"
-    return Plan(subjects, tuple(find_variants(METHODS)), (0,), out, command="lslam compare good silent broken")
+    output = OutputOptions(out, command="lslam compare good silent broken")
+    return Plan(subjects, tuple(find_variants(METHODS)), (0,), output)
 
 
 @pytest.fixture(scope="module")
 def made(plan: Plan) -> Comparison:
-    return compare(plan)
+    return run_comparison(plan)
 
 
 def one(comparison: Comparison, sequence: str, method: str) -> RunScore:
@@ -75,7 +76,7 @@ def one(comparison: Comparison, sequence: str, method: str) -> RunScore:
 def test_every_cell_is_a_run_folder_with_the_numbers_of_its_own_files(made: Comparison, plan: Plan) -> None:
     for method in METHODS:
         run = one(made, "good", method)
-        assert run.folder == plan.out / "runs" / "good" / f"{method}-s0"
+        assert run.folder == plan.output.out / "runs" / "good" / f"{method}-s0"
         sequence = open_sequence(plan.subjects[0].path or "")
         assert sequence.ground_truth is not None
         score = evaluate(read_trajectory(run.folder), sequence.ground_truth, calibration=sequence.calibration)
@@ -115,39 +116,40 @@ def test_what_fails_is_a_row_with_its_reason_and_no_pair(made: Comparison) -> No
 
 
 def test_files_are_there_and_agree(made: Comparison, plan: Plan) -> None:
-    document: dict[str, Any] = json.loads((plan.out / "compare.json").read_text())
+    document: dict[str, Any] = json.loads((plan.output.out / "compare.json").read_text())
     assert (document["schema"], document["status"]) == ("lslam-compare", "done")
     assert [r["values"].get("ate.se3") for r in document["runs"]] == [r.values.get("ate.se3") for r in made.runs]
-    with (plan.out / "compare.csv").open() as stream:
+    with (plan.output.out / "compare.csv").open() as stream:
         rows = list(csv.DictReader(stream))
     assert len(rows) == 6
     assert float(rows[0]["ate.se3 (m)"]) == pytest.approx(made.runs[0].values["ate.se3"])
     assert rows[2]["ate.se3 (m)"] == ""
-    assert "silent & kiss-icp & no ground truth" in (plan.out / "compare.tex").read_text()
-    page = (plan.out / "compare.html").read_text()
+    assert "silent & kiss-icp & no ground truth" in (plan.output.out / "compare.tex").read_text()
+    page = (plan.output.out / "compare.html").read_text()
     assert page.count("data:image/png") >= 4
     assert "runs/good/icp-s0/report.html" in page
 
 
 def test_resume_runs_only_what_is_missing_or_changed(made: Comparison, plan: Plan, tmp_path: Path) -> None:
     out = tmp_path / "copy"
-    shutil.copytree(plan.out, out)
+    shutil.copytree(plan.output.out, out)
     with pytest.raises(OutputExistsError, match="--resume"):
-        compare(replace(plan, out=out))
-    two = replace(plan, out=out, subjects=plan.subjects[:2], resume=True)
+        run_comparison(replace(plan, output=OutputOptions(out)))
+    two = replace(plan, output=OutputOptions(out, resume=True), subjects=plan.subjects[:2])
     (out / "runs" / "good" / "icp-s0.json").unlink()
     seen: list[str] = []
-    again = compare(two, StudyProgress(on_step=seen.append))
+    again = run_comparison(two, StudyProgress(on_step=seen.append))
     assert seen == ["good icp seed 0"]
     assert [r.is_reused for r in again.runs] == [False, True, True, True]
     assert one(again, "good", "icp").values["ate.se3"] == one(made, "good", "icp").values["ate.se3"]
-    anew = replace(two, variants=plan.variants[:1], subjects=plan.subjects[:1], overwrite=True, resume=False)
-    assert not compare(anew).runs[0].is_reused
+    output = OutputOptions(out, overwrite=True)
+    anew = replace(two, variants=plan.variants[:1], subjects=plan.subjects[:1], output=output)
+    assert not run_comparison(anew).runs[0].is_reused
 
 
 def test_resume_goes_on_with_a_run_that_was_begun(made: Comparison, plan: Plan, tmp_path: Path) -> None:
     out, path = tmp_path / "copy", plan.subjects[0].path
-    shutil.copytree(plan.out, out)
+    shutil.copytree(plan.output.out, out)
     folder = out / "runs" / "good" / "icp-s0"
     shutil.rmtree(folder)
     (out / "runs" / "good" / "icp-s0.json").unlink()
@@ -156,14 +158,14 @@ def test_resume_goes_on_with_a_run_that_was_begun(made: Comparison, plan: Plan, 
     stop_at_7 = Watch(on_step=lambda: done.append(None), should_stop=lambda: len(done) >= 7)
     with pytest.raises(InterruptedRunError):
         lslam.run(open_sequence(path), plan.variants[0].config, out=folder, watch=stop_at_7)
-    one_subject = replace(plan, out=out, subjects=plan.subjects[:1])
-    again = one(compare(replace(one_subject, resume=True)), "good", "icp")
+    one_subject = replace(plan, subjects=plan.subjects[:1])
+    again = one(run_comparison(replace(one_subject, output=OutputOptions(out, resume=True))), "good", "icp")
     # The first twenty scans of a run are decided together, and this one has fourteen.
     assert json.loads((folder / "manifest.json").read_text())["resumed_after_scans"] == [14]
     assert again.values["ate.se3"] == one(made, "good", "icp").values["ate.se3"]
     assert "run_s" in one(made, "good", "icp").values
     assert "run_s" not in again.values, "the seconds of its second half are not those of a run"
-    compare(replace(one_subject, overwrite=True))
+    run_comparison(replace(one_subject, output=OutputOptions(out, overwrite=True)))
     assert "resumed_after_scans" not in json.loads((folder / "manifest.json").read_text())
 
 
@@ -172,11 +174,11 @@ def test_with_and_without_the_imu_are_runs_and_pairs_of_their_own(
 ) -> None:
     variants = tuple(find_variants(("icp",), None, ["map.write=false", "report.html=false"], imu="both"))
     with pytest.raises(InputError, match=r"silent has no IMU.*imu\.csv.*run without --imu"):
-        compare(Plan(subjects[1:2], variants, (0,), tmp_path / "none"))
+        run_comparison(Plan(subjects[1:2], variants, (0,), OutputOptions(tmp_path / "none")))
     assert not (tmp_path / "none").exists()
     folder = record(simulate("block", count=30, lidar="sample", imu="icm20948"), tmp_path / "good").sequence
-    plan = Plan((Subject("good", folder),), variants, (0,), tmp_path / "out")
-    made = compare(plan)
+    plan = Plan((Subject("good", folder),), variants, (0,), OutputOptions(tmp_path / "out"))
+    made = run_comparison(plan)
     assert [(r.method, r.status, r.values.get("imu_used")) for r in made.runs] == [
         ("icp", "done", None), ("icp+imu", "done", 1.0),
     ]  # fmt: skip
@@ -184,7 +186,7 @@ def test_with_and_without_the_imu_are_runs_and_pairs_of_their_own(
     measured = (folder / "imu.csv").read_text().splitlines()
     still = [line.split(",")[0] + ",0" * 6 for line in measured[1:]]
     (folder / "imu.csv").write_text("\n".join([measured[0], *still]) + "\n")
-    again = compare(replace(plan, resume=True))
+    again = run_comparison(replace(plan, output=OutputOptions(tmp_path / "out", resume=True)))
     assert one(again, "good", "icp+imu").values["imu_used"] == 0.0
     assert [note for note in again.notes if "refused: good icp+imu;" in note]
 
@@ -192,10 +194,10 @@ def test_with_and_without_the_imu_are_runs_and_pairs_of_their_own(
 def test_a_folder_that_is_something_else_is_left_alone(plan: Plan, tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("years")
     with pytest.raises(OutputExistsError, match="not a comparison"):
-        compare(replace(plan, out=tmp_path, overwrite=True))
+        run_comparison(replace(plan, output=OutputOptions(tmp_path, overwrite=True)))
     assert [p.name for p in tmp_path.iterdir()] == ["thesis.tex"]
     with pytest.raises(UsageError, match="give one of them"):
-        compare(replace(plan, out=tmp_path, overwrite=True, resume=True))
+        run_comparison(replace(plan, output=OutputOptions(tmp_path, overwrite=True, resume=True)))
 
 
 @pytest.mark.parametrize(
@@ -227,12 +229,12 @@ def test_a_process_that_dies_is_a_crashed_job_that_is_tried_again(plan: Plan, tm
     path = plan.subjects[0].path
     assert path is not None
     job = Job("good", "icp", 0, path, plan.variants[0].config, tmp_path / "runs" / "icp-s0", "digest", "")
-    run_jobs([job], WorkerPool(1), StudyProgress(), work=die)
+    Local(1, is_persistent=False, tries=1).run([job], StudyProgress(), work=die)
     state = read_state(job.state_file)
     assert state is not None
     assert state.status == "crashed"
     assert state.reason.startswith("the process was killed by SIGSEGV")
-    assert finished([job]) == set()
+    assert folders_of_finished([job]) == set()
 
 
 @pytest.mark.parametrize(("sideways", "alignment"), [(0.02, "origin"), (20.0, "se3")])

@@ -19,7 +19,8 @@ from lslam.simulation.record import record
 from lslam.simulation.scenarios import simulate
 from lslam.studies.grid import Cell, Job, expand
 from lslam.studies.results_csv import State, is_reusable, read_state, write_state
-from lslam.studies.subjects import Scene, find_subjects, scans_needed, simulate_once
+from lslam.studies.runner import StudyProgress
+from lslam.studies.subjects import Scene, count_scans, find_subjects, simulate_once
 from lslam.studies.variants import Variant, find_variants
 
 
@@ -188,18 +189,14 @@ def test_names_stay_inside_the_folder() -> None:
 
 def test_a_simulation_has_the_scans_that_will_be_used() -> None:
     short = load_config(None, ["input.start=5", "input.count=3", "input.skip_frames=4"], {}).input
-    assert scans_needed([short, load_config(None, ["input.count=9"], {}).input]) == 14
-    assert scans_needed([short, Config().input]) is None
+    assert count_scans([short, load_config(None, ["input.count=9"], {}).input]) == 14
+    assert count_scans([short, Config().input]) is None
 
 
 def test_a_scenario_is_simulated_once(tmp_path: Path) -> None:
     steps: list[str] = []
-    made = [
-        simulate_once(
-            Scene("block", 2), 3, tmp_path, lambda stage, n: steps.append(stage), lambda: steps.append("scan")
-        )
-        for _ in range(2)
-    ]
+    progress = StudyProgress(lambda stage, *of: steps.append(stage), lambda note: steps.append("scan"))
+    made = [simulate_once(Scene("block", 2), 3, tmp_path, progress) for _ in range(2)]
     assert made[0] == made[1]
     assert steps == ["simulating block, seed 3", "scan", "scan"]
     assert len(open_sequence(made[0])) == 2

@@ -13,9 +13,9 @@ from lslam.core.types.comparison import Comparison, RunScore
 from lslam.io.formats.osm_buildings import read_buildings
 from lslam.io.readers import open_sequence
 from lslam.simulation.scenario_files import scenario_names
-from lslam.studies.compare import compare
+from lslam.studies.compare import Plan, run_comparison
 from lslam.studies.grid import Cell
-from lslam.studies.plan import Plan
+from lslam.studies.options import OutputOptions
 from lslam.studies.ready_comparison import comparison_names, find_comparison
 from lslam.studies.subjects import Subject
 
@@ -34,18 +34,18 @@ def test_what_is_printed_and_stated_is_of_what_is_run(name: str) -> None:
     systems = {variant.name.split("@")[0] for variant in ready.variants(())}
     assert set(ready.sequences) <= set(scenario_names())
     assert set(ready.quick.sequences) <= set(ready.sequences)
-    assert {printed.sequence for printed in ready.printed} <= set(ready.sequences)
-    assert {system for printed in ready.printed for system in printed.values} <= systems
-    assert {end for stated in ready.stated for end in (stated.left, stated.right)} <= systems
+    assert {printed.sequence for printed in ready.numbers} <= set(ready.sequences)
+    assert {system for printed in ready.numbers for system in printed.values} <= systems
+    assert {end for stated in ready.claims for end in (stated.left, stated.right)} <= systems
 
 
 def test_numbers_are_those_of_the_theses() -> None:
     girolimetto, del_tufo = find_comparison("girolimetto"), find_comparison("del-tufo")
-    assert girolimetto._printed("closed", "thesis-icp", "before") == 2.046  # table 4.3
-    assert girolimetto._printed("closed-hard", "thesis-icp", "after") == 1.169  # table 4.3
-    assert girolimetto._printed("small-eight", "thesis-loam-map+imu", "after") == 0.360  # table 5.4
-    assert girolimetto._printed("open", "thesis-loam+imu", "before") is None
-    assert del_tufo._printed("residential", "thesis-improved@mild", "ate") == 1.223  # table 4.2
+    assert girolimetto._number("closed", "thesis-icp", "before") == 2.046  # table 4.3
+    assert girolimetto._number("closed-hard", "thesis-icp", "after") == 1.169  # table 4.3
+    assert girolimetto._number("small-eight", "thesis-loam-map+imu", "after") == 0.360  # table 5.4
+    assert girolimetto._number("open", "thesis-loam+imu", "before") is None
+    assert del_tufo._number("residential", "thesis-improved@mild", "ate") == 1.223  # table 4.2
 
 
 def test_a_number_and_an_order_are_judged_by_runs() -> None:
@@ -102,7 +102,7 @@ def test_a_further_system_runs_where_a_number_of_it_is_printed() -> None:
     (integrated,) = [v for v in ready.variants(()) if v.config.imu.velocity == "integrated"]
     assert integrated.uses_imu
     runs = {
-        drive: integrated in ready.fitted(ready.variants(()), Cell(drive, SAMPLE, 0, ""), Path())
+        drive: integrated in ready.variants_on(ready.variants(()), Cell(drive, SAMPLE, 0, ""), Path())
         for drive in ready.sequences
     }
     assert [drive for drive, is_run in runs.items() if is_run] == ["open", "open-hard"]
@@ -125,7 +125,7 @@ def test_a_system_on_a_map_is_judged_against_one_without_and_one_on_the_same() -
 def test_maps_are_wrong_as_it_is_said(tmp_path: Path) -> None:
     ready = find_comparison("del-tufo")
     cell = Cell("residential", SAMPLE, 3, "")
-    configs = {variant.name: variant.config for variant in ready.fitted(ready.variants(()), cell, tmp_path)}
+    configs = {variant.name: variant.config for variant in ready.variants_on(ready.variants(()), cell, tmp_path)}
     assert {config.debug.drift_seed for config in configs.values()} == {3}
     assert not configs["hdl"].osm.extract
     extracts = {kind: Path(configs[f"thesis-improved@{kind}"].osm.extract) for kind in ready.maps}
@@ -144,8 +144,9 @@ def made(out: Path) -> Comparison:
     few = {"methods": ("thesis-loam",), "imu": "off", "settings": ("input.count=8",), "systems": {}}
     ready = find_comparison("girolimetto").model_copy(update=few)
     subjects = (Subject("open", scenario="open"),)
-    plan = Plan(subjects, tuple(ready.variants(())), (5,), out, resume=out.is_dir(), command="lslam", ready=ready)
-    return compare(plan)
+    output = OutputOptions(out, resume=out.is_dir(), command="lslam")
+    plan = Plan(subjects, tuple(ready.variants(())), (5,), output, ready=ready)
+    return run_comparison(plan)
 
 
 @pytest.mark.usefixtures("forked_runs")

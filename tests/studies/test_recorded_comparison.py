@@ -14,9 +14,9 @@ from lslam.core.errors import InputError, UsageError
 from lslam.core.geometry import geodesy, se3, so3
 from lslam.io.formats.trajectory_files import read_trajectory
 from lslam.io.readers.kitti_raw import start_on_earth
-from lslam.studies.compare import compare
+from lslam.studies.compare import Plan, run_comparison
 from lslam.studies.grid import Cell
-from lslam.studies.plan import Plan
+from lslam.studies.options import OutputOptions
 from lslam.studies.ready_comparison import _start_of, _world_of, find_comparison
 from lslam.studies.subjects import find_subjects
 
@@ -96,11 +96,10 @@ def test_it_runs_on_the_recording_beside_the_numbers_of_the_thesis(kitti: Path, 
         tuple(find_subjects(few.sequences, kitti)),
         tuple(variants),
         (100,),
-        tmp_path / "out",
-        data_root=kitti,
+        OutputOptions(tmp_path / "out", data_root=kitti),
         ready=few,
     )
-    found = compare(plan)
+    found = run_comparison(plan)
     values = {run.method: run.values for run in found.runs}
     assert set(values) == {"hdl", "prior@osm", "thesis-improved@osm"}
     assert values["prior@osm"]["planar_ate"] < 0.3
@@ -108,6 +107,6 @@ def test_it_runs_on_the_recording_beside_the_numbers_of_the_thesis(kitti: Path, 
     assert numbers["thesis-improved@osm", "planar ATE, m"] == "1.223"  # table 4.2
     assert not any(variant.config.debug.drift for variant in variants)
     cell = Cell("", kitti / "sequences" / "07", None, "", data_root=kitti)
-    extracts = {Path(v.config.osm.extract).name for v in plan.fitted(cell) if v.method != "hdl"}
+    extracts = {Path(v.config.osm.extract).name for v in plan.variants_on(cell) if v.method != "hdl"}
     assert extracts == {"town.osm"}
-    assert all(run.is_reused for run in compare(replace(plan, resume=True)).runs)
+    assert all(run.is_reused for run in run_comparison(replace(plan, output=replace(plan.output, resume=True))).runs)

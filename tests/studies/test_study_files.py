@@ -9,10 +9,9 @@ import pytest
 
 from lslam.core.config.study import Kind
 from lslam.core.errors import UsageError
-from lslam.studies.expanded_study import ExpandedStudy
-from lslam.studies.output import OutputOptions
-from lslam.studies.study_files import find_study, study_names
-from lslam.studies.sweep import Sweep, expand_study
+from lslam.studies.jobs import ExpandedStudy
+from lslam.studies.options import OutputOptions, find_study, study_names
+from lslam.studies.study_runs import Sweep, expand_study
 
 ROOT = Path(__file__).resolve().parents[2]
 # Points of each study x (without and with the IMU), beside ones aside.

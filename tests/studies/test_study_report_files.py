@@ -9,7 +9,7 @@ import pytest
 from lslam.core.config.study import ExpectedFinding
 from lslam.core.types.study import StudyRow
 from lslam.studies.results_csv import read_study_csv, write_study_csv
-from lslam.studies.sweep import report_folder, write_study_report
+from lslam.studies.study_runs import report_folder, write_study_report
 
 
 def test_report_of_rows_read_back_is_that_of_the_rows(tmp_path: Path) -> None:

@@ -23,16 +23,14 @@ from lslam.core.errors import (
     UsageError,
 )
 from lslam.core.types.study import StudyRow
-from lslam.studies.estimate import estimate, from_finished
-from lslam.studies.expanded_study import ExpandedStudy
-from lslam.studies.jobs import Local
-from lslam.studies.output import OutputOptions
+from lslam.studies.estimate import estimate, extrapolate
+from lslam.studies.jobs import ExpandedStudy, Local
+from lslam.studies.options import OutputOptions, find_study
 from lslam.studies.results import is_comparable
 from lslam.studies.results_csv import VERSION, State, read_state, read_study_csv
 from lslam.studies.runner import StudyProgress
-from lslam.studies.study_files import find_study
-from lslam.studies.subjects import used
-from lslam.studies.sweep import Sweep, expand_study, run_sweep, write_study_report
+from lslam.studies.study_runs import Sweep, expand_study, run_sweep, write_study_report
+from lslam.studies.subjects import scans_of_run
 
 pytestmark = pytest.mark.usefixtures("forked_runs")
 
@@ -319,22 +317,22 @@ def test_the_time_is_that_of_finished_runs_of_the_same_kind(sweep: Sweep, made: 
     seconds = {job.folder: read_state(job.state_file).seconds for job in jobs}  # type: ignore[union-attr]
     same = [job for job in jobs if variants[job.method].method == variants[jobs[0].method].method]
     same = [job for job in same if variants[job.method].is_beside == variants[jobs[0].method].is_beside]
-    every = from_finished(jobs, jobs, variants, 1)
+    every = extrapolate(jobs, jobs, variants, 1)
     assert every is not None
     assert every.seconds == pytest.approx(sum(seconds.values())), "all anew"
     jobs[0].state_file.unlink()
-    guess = from_finished(jobs, jobs[:1], variants, 1)
+    guess = extrapolate(jobs, jobs[:1], variants, 1)
     assert guess is not None
     assert guess.seconds == pytest.approx(np.mean([seconds[job.folder] for job in same[1:]]))
-    assert from_finished(jobs, [*jobs[:1], *jobs[:1]], variants, 2).seconds == guess.seconds  # type: ignore[union-attr]
+    assert extrapolate(jobs, [*jobs[:1], *jobs[:1]], variants, 2).seconds == guess.seconds  # type: ignore[union-attr]
     other = expand_study(elsewhere(sweep, tmp_path / "out", True, config={"input": {"count": 9}}))
-    assert from_finished(other.jobs, other.jobs, other.variants, 1) is None, "runs of another configuration"
+    assert extrapolate(other.jobs, other.jobs, other.variants, 1) is None, "runs of another configuration"
 
 
 def test_pilots_of_scans_far_along_the_way_have_them(
     sweep: Sweep, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("lslam.studies.estimate._SIMULATED", 6)
+    monkeypatch.setattr("lslam.studies.estimate._MOST_SCANS", 6)
     late = TREE["sequences"][0] | {"start": 9, "count": 4}
     jobs = expand_study(Sweep(study(sequences=[late], beside=[]), OutputOptions(tmp_path / "out")))
     assert estimate(jobs.jobs, jobs.variants, 1).pilots > 1
@@ -355,4 +353,4 @@ def test_times_are_comparable_of_runs_that_had_a_core(is_alone: bool, waited: fl
 
 def test_scans_used_are_those_a_run_counts(made: list[StudyRow], sweep: Sweep) -> None:
     for job, row in zip(expand_study(sweep).jobs, made, strict=True):
-        assert used(16, job.config.input) == row.scans
+        assert scans_of_run(16, job.config.input) == row.scans

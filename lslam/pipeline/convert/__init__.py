@@ -8,7 +8,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from lslam.core.errors import OutputError, OutputExistsError, UsageError, cause
+from lslam.core.errors import OutputError, UsageError, cause
+from lslam.pipeline.run_folder import require_new
 
 SUFFIXES = {"bag": ".bag", "mcap": ".mcap", "sqlite": ".db3"}
 
@@ -24,8 +25,7 @@ def check_output(kind: str, out: Path, is_zstd: bool, overwrite: bool) -> None:
         raise UsageError(f"--out {out}: a name in {out.suffix} is not for --to {kind}")
     if kind == "bag" and out.suffix != ".bag":
         raise UsageError(f"--out {out}: a ROS 1 bag is one file, its name ends in .bag")
-    if out.exists() and not overwrite:
-        raise OutputExistsError(f"{out} exists already: choose another --out, or --overwrite it")
+    require_new(out, overwrite)
 
 
 def check_beside(out: Path, source: Path, what: str) -> None:
@@ -36,21 +36,21 @@ def check_beside(out: Path, source: Path, what: str) -> None:
 
 
 @contextmanager
-def staged(out: Path) -> Iterator[Path]:
+def stage(out: Path) -> Iterator[Path]:
     """Temporary path that replaces `out`, a file or folder, when the block ends without an error.
 
     Raises OutputError naming what cannot be written.
     """
-    stage = out.with_name(out.name + ".new")
+    folder = out.with_name(out.name + ".new")
     try:
-        shutil.rmtree(stage, ignore_errors=True)
-        stage.mkdir(parents=True)
-        made = stage / out.name
-        yield made
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        path = folder / out.name
+        yield path
         if out.exists():
-            out.rename(stage / "old")
-        os.replace(made, out)
+            out.rename(folder / "old")
+        os.replace(path, out)
     except OSError as error:
         raise OutputError(f"{error.filename or out} cannot be written: {cause(error)}") from None
     finally:
-        shutil.rmtree(stage, ignore_errors=True)
+        shutil.rmtree(folder, ignore_errors=True)

@@ -17,7 +17,7 @@ from lslam.core.types.sequence import Sequence
 from lslam.io.formats.point_files import read_cloud
 from lslam.maps.clean import PosedScan
 from lslam.odometry.frontend.register_scans import read_ahead
-from lslam.pipeline.convert import bag_messages, check_beside, check_output, staged
+from lslam.pipeline.convert import check_beside, check_output, stage
 from lslam.pipeline.convert.bag_writer import MAP_TOPIC, PATH_TOPIC, BagWriter
 from lslam.pipeline.map_files import in_own_world
 from lslam.pipeline.map_pass import scan_poser
@@ -34,9 +34,8 @@ PATHS = 20
 
 @dataclass(frozen=True)
 class RunBag:
-    """Result of `convert_run`: path, and numbers of poses, clouds and map points."""
+    """Result of `convert_run`: numbers of poses, clouds and map points."""
 
-    path: Path
     poses: int
     clouds: int
     map_points: int
@@ -80,34 +79,33 @@ def convert_run(
         raise InputError(f"{run.folder / 'trajectory.tum'} has no pose")
     covariances = covariances_of(run)
     due, clouds = _path_ends(len(stamps)), 0
-    with staged(out) as made, BagWriter(made, kind, is_zstd) as writer:
+    with stage(out) as path, BagWriter(path, kind, is_zstd) as writer:
         map_points = _write_map(writer, run, int(stamps[0]))
-        for k, posed in enumerate(_scans_by_pose(run, scans)):
+        for k, scan in enumerate(_scans_by_pose(run, scans)):
             _write_pose(
                 writer, int(stamps[k]), poses[k], None if covariances is None else np.nan_to_num(covariances[k])
             )
-            if posed is not None:
-                _write_points(writer, int(stamps[k]), posed, voxel)
+            if scan is not None:
+                _write_points(writer, int(stamps[k]), scan, voxel)
                 clouds += 1
             if k in due:
-                some = _spread(k + 1, MOST_PATH_POSES)
-                path = bag_messages.path(writer.store, stamps[some], poses[some], WORLD)
-                writer.write(PATH_TOPIC, int(stamps[k]), path)
+                some = _indices(k + 1, MOST_PATH_POSES)
+                writer.write(PATH_TOPIC, int(stamps[k]), writer.messages.path(stamps[some], poses[some], WORLD))
             on_scan()
-    return RunBag(out, len(stamps), clouds, map_points)
+    return RunBag(len(stamps), clouds, map_points)
 
 
 def _write_pose(writer: BagWriter, stamp: int, T: Floats, covariance: Floats | None) -> None:
-    writer.write("/tf", stamp, bag_messages.transforms(writer.store, stamp, {(WORLD, BODY): T}))
-    writer.write(POSE_TOPIC, stamp, bag_messages.odometry(writer.store, stamp, T, WORLD, BODY, covariance))
+    writer.write("/tf", stamp, writer.messages.transforms(stamp, {(WORLD, BODY): T}))
+    writer.write(POSE_TOPIC, stamp, writer.messages.odometry(stamp, T, WORLD, BODY, covariance))
 
 
-def _write_points(writer: BagWriter, stamp: int, posed: PosedScan, voxel: float) -> None:
-    points, intensity = posed.points, posed.intensity
+def _write_points(writer: BagWriter, stamp: int, scan: PosedScan, voxel: float) -> None:
+    points, intensity = scan.points, scan.intensity
     if voxel:
-        kept = first_points(np.ascontiguousarray(points, np.float32), voxel)
-        points, intensity = points[kept], None if intensity is None else intensity[kept]
-    writer.write(POINTS_TOPIC, stamp, bag_messages.points(writer.store, stamp, points, intensity, BODY))
+        some = first_points(np.ascontiguousarray(points, np.float32), voxel)
+        points, intensity = points[some], None if intensity is None else intensity[some]
+    writer.write(POINTS_TOPIC, stamp, writer.messages.points(stamp, points, intensity, BODY))
 
 
 def _scans_by_pose(run: EarlierRun, scans: Sequence | None) -> Iterator[PosedScan | None]:
@@ -133,10 +131,10 @@ def _write_map(writer: BagWriter, run: EarlierRun, stamp: int) -> int:
     cloud = in_own_world(path, read_cloud(path))[0]
     if len(cloud) > MOST_MAP_POINTS:
         log.info("%s: %d of its %d points are written", path, MOST_MAP_POINTS, len(cloud))
-    kept = _spread(len(cloud), MOST_MAP_POINTS)
-    intensity = None if cloud.intensity is None else cloud.intensity[kept]
-    writer.write(MAP_TOPIC, stamp, bag_messages.points(writer.store, stamp, cloud.points[kept], intensity, WORLD))
-    return len(kept)
+    some = _indices(len(cloud), MOST_MAP_POINTS)
+    intensity = None if cloud.intensity is None else cloud.intensity[some]
+    writer.write(MAP_TOPIC, stamp, writer.messages.points(stamp, cloud.points[some], intensity, WORLD))
+    return len(some)
 
 
 def _path_ends(count: int) -> set[int]:
@@ -144,10 +142,6 @@ def _path_ends(count: int) -> set[int]:
     return set(np.unique(np.ceil(np.linspace(0, count, PATHS + 1)[1:]).astype(int) - 1).tolist())
 
 
-def _spread(count: int, most: int) -> NDArray[np.intp]:
+def _indices(count: int, most: int) -> NDArray[np.intp]:
     """At most `most` indices spread evenly over `count`, including the first and the last."""
-    return (
-        np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.intp))
-        if count
-        else np.zeros(0, np.intp)
-    )
+    return np.unique(np.linspace(0, max(count - 1, 0), min(count, most)).round().astype(np.intp))

@@ -26,8 +26,8 @@ from lslam.io.formats.trajectory_lines import write_kitti, write_tum
 from lslam.io.readers.sequence_on_disk import add_labels
 from lslam.odometry.frontend.register_scans import sweep_of
 from lslam.odometry.inertial.constant_velocity import Course
-from lslam.pipeline.convert import bag_messages, check_beside, check_output, staged
-from lslam.pipeline.convert.bag_writer import BagWriter
+from lslam.pipeline.convert import check_beside, check_output, stage
+from lslam.pipeline.convert.bag_writer import BagMessages, BagWriter
 from lslam.pipeline.convert.convert_trajectory import change_frame
 from lslam.pipeline.map_pass import motion_within
 from lslam.registration.preprocessing.deskew import deskew_points
@@ -35,18 +35,19 @@ from lslam.registration.preprocessing.views import MergedLidars
 
 log = logging.getLogger("lslam")
 
+# Stamp, rank among equal stamps, topic, and the function that makes the message.
+Message = tuple[int, int, str, Callable[[], Any]]
 LIDARS = ("merged", "topics", "frames")
 NUMBER = "00"  # of the one sequence in KITTI's layout
 TRUTH_FILE, IMU_FILE, GNSS_FILE = "ground_truth.tum", "imu.csv", "gnss.csv"
 
 
 @dataclass(frozen=True)
-class Converted:
-    """Result of `convert_sequence`: path, number of scans, and number of unreadable ones."""
+class ScanCount:
+    """Result of `convert_sequence`: number of scans, and number of unreadable ones, which are left out."""
 
-    path: Path
     scans: int
-    skipped: int
+    unreadable: int
 
 
 def convert_sequence(
@@ -59,7 +60,7 @@ def convert_sequence(
     trajectory: Trajectory | None = None,
     lidars: str = "merged",
     on_scan: Callable[[], None] = lambda: None,
-) -> Converted:
+) -> ScanCount:
     """Write `sequence` to `out`, whole or not at all.
 
     Parameters
@@ -82,12 +83,12 @@ def convert_sequence(
             )
         source.take_apart(sequence, lidars == "frames")
     check_beside(out, sequence.path, "the sequence")
-    with staged(out) as made:
+    with stage(out) as path:
         if kind == "kitti":
-            _write_kitti(source, made)
+            _write_kitti(source, path)
         else:
-            _write_bag(source, made, kind, is_zstd)
-    return Converted(out, source.written, source.skipped)
+            _write_bag(source, path, kind, is_zstd)
+    return ScanCount(source.readable, source.unreadable)
 
 
 @dataclass(frozen=True)
@@ -109,20 +110,20 @@ class _Source:
     def __init__(self, sequence: Sequence, trajectory: Trajectory | None, on_scan: Callable[[], None]) -> None:
         self.sequence, self.trajectory, self.on_scan = sequence, trajectory, on_scan
         self.lidars, self.keys = [_Lidar(sequence)], SequenceInfo()
-        self.written = self.skipped = 0
+        self.readable = self.unreadable = 0
         self.sweep = None if trajectory is None else sweep_of(sequence)
         if trajectory is not None:
             self.trajectory = self._check(trajectory)
 
-    def take_apart(self, merged: MergedLidars, on_one_topic: bool) -> None:
+    def take_apart(self, lidars: MergedLidars, on_one_topic: bool) -> None:
         """Split merged scans by LiDAR, and state which LiDARs are merged when the bag is read."""
-        others = merged.further_lidars
+        others = lidars.further_lidars
         names = [re.sub(r"\W+", "_", other.name).strip("_") for other in others]
         if len(set(names)) < len(names):
             names = [str(number) for number in range(2, len(names) + 2)]
         frames = ["lidar", *(f"lidar_{name}" for name in names)]
         topics = ["/points" if on_one_topic else f"/{frame}/points" for frame in frames]
-        parts = [(merged.whole, None), *((other.scans, other.T_lidar_other) for other in others)]
+        parts = [(lidars.whole, None), *((other.scans, other.T_lidar_other) for other in others)]
         self.lidars = [
             _Lidar(scans, topic, frame, T) for (scans, T), topic, frame in zip(parts, topics, frames, strict=True)
         ]
@@ -131,20 +132,21 @@ class _Source:
 
     def scans(self, lidar: _Lidar | None = None) -> Iterator[Scan]:
         lidar = lidar or self.lidars[0]
-        skipped = 0
+        unreadable = 0
         for k in range(len(lidar.scans)):
             try:
                 scan = self._deskew(lidar.scans.scan(k))
             except InputError as error:
                 log.warning("left out: %s", error)
-                skipped += 1
+                unreadable += 1
             else:
                 yield scan
             if lidar is self.lidars[0]:
                 self.on_scan()
-        if skipped == len(lidar.scans):
-            raise InputError(f"{lidar.scans.path}: none of its {skipped} scans can be read")
-        self.written, self.skipped = self.written + len(lidar.scans) - skipped, self.skipped + skipped
+        if unreadable == len(lidar.scans):
+            raise InputError(f"{lidar.scans.path}: none of its {unreadable} scans can be read")
+        self.readable += len(lidar.scans) - unreadable
+        self.unreadable += unreadable
 
     def _check(self, trajectory: Trajectory) -> Trajectory:
         """The trajectory as LiDAR poses. Raises InputError when scans cannot be deskewed or no trajectory is given."""
@@ -152,8 +154,7 @@ class _Source:
             raise InputError(f"{self.sequence.path} has no per-point times: there is nothing to deskew")
         if len(trajectory) < 2 or not trajectory.has_stamps:
             raise InputError(f"{trajectory.source} has no stamped poses to deskew along")
-        is_known = trajectory.frame in FRAMES
-        return change_frame(trajectory, "lidar", self.calibration) if is_known else trajectory
+        return change_frame(trajectory, "lidar", self.calibration) if trajectory.frame in FRAMES else trajectory
 
     def _deskew(self, scan: Scan) -> Scan:
         if self.trajectory is None or scan.times is None:
@@ -168,18 +169,17 @@ class _Source:
     @property
     def calibration(self) -> Calibration:
         """Known extrinsics; those that a reader assumed are left out."""
-        known = self.sequence.calibration
-        return replace(known, T_lidar_imu=None) if getattr(self.sequence, "has_assumed_extrinsics", False) else known
+        stated = self.sequence.calibration
+        return replace(stated, T_lidar_imu=None) if getattr(self.sequence, "has_assumed_extrinsics", False) else stated
 
     def info(self) -> SequenceInfo:
-        is_deskewed = self.trajectory is not None
         return replace(
             self.keys,
             name=self.sequence.name,
             sensor=getattr(self.sequence, "sensor", None),
             rings=getattr(self.sequence, "rings", None),
             rate_hz=self.sequence.rate_hz,
-            motion_compensated=True if is_deskewed else self.sequence.motion_compensated,
+            motion_compensated=self.trajectory is not None or self.sequence.motion_compensated,
             compensated_to=None if self.sweep is None else self.sweep.instant,
             T_cam0_lidar=self.calibration.T_cam0_lidar,
             T_lidar_imu=self.calibration.T_lidar_imu,
@@ -191,40 +191,35 @@ class _Source:
 def _write_bag(source: _Source, out: Path, kind: str, is_zstd: bool) -> None:
     with BagWriter(out, kind, is_zstd) as writer:
         begin = _first_stamp(source)
-        writer.write(INFO_TOPIC, begin, bag_messages.text(writer.store, sequence_toml_text(source.info())))
+        writer.write(INFO_TOPIC, begin, writer.messages.text(sequence_toml_text(source.info())))
         transforms = _transforms(source.calibration)
         transforms |= {("lidar", one.frame): one.T_lidar_other for one in source.lidars[1:]}
         if transforms:
-            writer.write("/tf_static", begin, bag_messages.transforms(writer.store, begin, transforms))
-        for stamp, _, topic, message in heapq.merge(*_messages(source, writer.store), key=lambda m: m[:2]):
-            writer.write(topic, stamp, message())
+            writer.write("/tf_static", begin, writer.messages.transforms(begin, transforms))
+        for stamp, _, topic, make in heapq.merge(*_messages(source, writer.messages), key=lambda m: m[:2]):
+            writer.write(topic, stamp, make())
 
 
-def _messages(source: _Source, store: Any) -> list[Iterator[tuple[int, int, str, Callable[[], Any]]]]:
-    """Messages by topic: stamp, rank among equal stamps, topic, and the function that makes the message."""
-    sequence, make = source.sequence, bag_messages
+def _messages(source: _Source, messages: BagMessages) -> list[Iterator[Message]]:
+    """Messages of each topic by their stamps."""
+    sequence = source.sequence
     imu, gnss, truth = sequence.imu, sequence.gnss, sequence.ground_truth
-    topics: list[Iterator[tuple[int, int, str, Callable[[], Any]]]] = [
-        _clouds(source, lidar, rank, store) for rank, lidar in enumerate(source.lidars, 3)
-    ]
+    topics = [_clouds(source, lidar, rank, messages) for rank, lidar in enumerate(source.lidars, 3)]
     if imu is not None:
         rows = zip(imu.stamps_ns.tolist(), imu.accel, imu.gyro, strict=True)
-        topics.append((t, 0, "/imu", lambda t=t, a=a, g=g: make.imu(store, t, a, g, "imu")) for t, a, g in rows)  # type: ignore[misc]
+        topics.append((t, 0, "/imu", partial(messages.imu, t, a, g, "imu")) for t, a, g in rows)
     if gnss is not None:
         fixes = zip(gnss.stamps_ns.tolist(), gnss.lat_lon_alt, gnss.sigma.tolist(), strict=True)
-        topics.append((t, 1, "/gnss", lambda t=t, p=p, s=s: make.fix(store, t, p, s, "gnss")) for t, p, s in fixes)  # type: ignore[misc]
+        topics.append((t, 1, "/gnss", partial(messages.fix, t, p, s, "gnss")) for t, p, s in fixes)
     if truth is not None:
         poses = zip(truth.stamps_ns.tolist(), truth.poses, strict=True)
-        topics.append(
-            (t, 2, "/ground_truth", lambda t=t, T=T: make.odometry(store, t, T, "world", "lidar"))  # type: ignore[misc]
-            for t, T in poses
-        )
+        topics.append((t, 2, "/ground_truth", partial(messages.odometry, t, T, "world", "lidar")) for t, T in poses)
     return topics
 
 
-def _clouds(source: _Source, lidar: _Lidar, rank: int, store: Any) -> Iterator[tuple[int, int, str, Callable[[], Any]]]:
+def _clouds(source: _Source, lidar: _Lidar, rank: int, messages: BagMessages) -> Iterator[Message]:
     for scan in source.scans(lidar):
-        yield scan.stamp_ns, rank, lidar.topic, partial(bag_messages.cloud, store, scan, lidar.frame)
+        yield scan.stamp_ns, rank, lidar.topic, partial(messages.cloud, scan, lidar.frame)
 
 
 def _first_stamp(source: _Source) -> int:

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from lslam.core import __version__
-from lslam.core.errors import InputError, OutputExistsError, UsageError
+from lslam.core.errors import InputError, UsageError
 from lslam.core.extras import importing, install_hint
 from lslam.core.geometry import se3
 from lslam.core.types.gnss import Georeference
@@ -25,6 +25,7 @@ from lslam.io.formats.trajectory_csv import write_csv
 from lslam.io.formats.trajectory_files import FORMATS
 from lslam.maps.georeference import Projection, to_lat_lon
 from lslam.pipeline.map_files import georeference_of, read_json
+from lslam.pipeline.run_folder import MANIFEST, require_new
 
 log = logging.getLogger("lslam")
 
@@ -37,29 +38,72 @@ def convert_trajectory(
     *,
     frame: str | None = None,
     overwrite: bool = False,
+    place: Georeference | Projection | None = None,
 ) -> Trajectory:
     """Write `trajectory` to `out` as `kind`, as poses of `frame`, by default the format's usual body. Returns the written one.
 
+    place : where on the Earth the world of the poses lies. `kml` and `gpx` need a georeference; a projection makes of `csv` a
+        table in its coordinate reference system. Poses that are not finite are left out then.
+
     Raises
     ------
-    InputError : the change of body needs an extrinsic that `calibration` does not have. UsageError : unknown `kind` or `frame`.
+    InputError : the change of body needs an extrinsic that `calibration` does not have, or no pose is finite.
+    UsageError : unknown `kind` or `frame`, or a coordinate reference system that does not count in metres.
     OutputExistsError : `out` is there and `overwrite` is not set.
     """
-    if kind not in FORMATS:
-        raise UsageError(f"no trajectory format {kind!r} to write: {', '.join(FORMATS)} are")
-    wanted = FORMATS[kind]
-    if out.exists() and not overwrite:
-        raise OutputExistsError(f"{out} exists already: choose another --out, or --overwrite it")
-    moved = change_frame(trajectory, frame or wanted.frame or trajectory.frame, calibration)
-    if not wanted.has_stamps:
+    if kind not in FORMATS and kind not in WRITERS:
+        raise UsageError(f"no trajectory format {kind!r} to write: {', '.join((*FORMATS, *WRITERS))} are")
+    if isinstance(place, Projection):
+        place.check()
+    if place is not None and frame == "cam0":
+        raise UsageError(f"--frame cam0: poses of the camera have a world of their own, --to {kind} takes lidar or imu")
+    require_new(out, overwrite)
+    if place is None:
+        return _convert(trajectory, kind, out, calibration, frame)
+    result = change_frame(trajectory, frame or trajectory.frame, calibration)
+    result = result.select(np.isfinite(result.positions).all(axis=1))
+    if not len(result):
+        raise InputError(f"{trajectory.source} has no pose that is finite")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    if isinstance(place, Georeference):
+        _write_on_earth(result, kind, out, place)
+        return result
+    # Rotations are about east, north and up of the grid.
+    result = replace(result, poses=place.carry(result.poses), covariances=None)
+    write_csv(out, result, place.name)
+    return result
+
+
+def _convert(trajectory: Trajectory, kind: str, out: Path, calibration: Calibration, frame: str | None) -> Trajectory:
+    """Write the poses in a world that lies nowhere."""
+    file_format = FORMATS[kind]
+    result = change_frame(trajectory, frame or file_format.frame or trajectory.frame, calibration)
+    if not file_format.has_stamps:
         log.info("%s files have no stamps: line i is pose i", kind.upper())
     elif not trajectory.has_stamps:
         raise InputError(
             f"{trajectory.source} has no stamps and --to {kind} needs them: --times names them, one a line"
         )
     out.parent.mkdir(parents=True, exist_ok=True)
-    wanted.write(out, moved)
-    return moved
+    file_format.write(out, result)
+    return result
+
+
+def _write_on_earth(trajectory: Trajectory, kind: str, out: Path, georeference: Georeference) -> None:
+    """Write the positions for map programs.
+
+    Degrees have 7 decimals (1 cm), heights above the WGS84 ellipsoid 3. Times are UTC, and left out where stamps are not
+    Unix time.
+    """
+    places = [
+        (round(lat, 7), round(lon, 7), round(h, 3))
+        for lat, lon, h in to_lat_lon(trajectory.positions, georeference).tolist()
+    ]
+    about = f"poses of {trajectory.frame} by lslam, heights in m above the WGS84 ellipsoid"
+    if georeference.method == "osm":
+        about += "; placed by buildings, © OpenStreetMap contributors, ODbL 1.0"
+    times = utc_of(trajectory.stamps_ns) if trajectory.has_stamps else None
+    WRITERS[kind](out, places, times, out.stem, about)
 
 
 def change_frame(trajectory: Trajectory, frame: str, calibration: Calibration) -> Trajectory:
@@ -165,10 +209,10 @@ def write_gpx(path: Path, places: Sequence[Place], times: Sequence[datetime] | N
 
 
 WRITERS = {"kml": write_kml, "gpx": write_gpx}
-TRAJECTORY, MANIFEST = "trajectory.tum", "manifest.json"
+TRAJECTORY = "trajectory.tum"
 
 
-def known_georeference(source: Path) -> Georeference | None:
+def find_georeference(source: Path) -> Georeference | None:
     """Georeference in the manifest of a run, by its folder or its `trajectory.tum`; None where there is none."""
     folder = source if source.is_dir() else source.parent
     if not (source.is_dir() or source.name == TRAJECTORY):
@@ -177,8 +221,8 @@ def known_georeference(source: Path) -> Georeference | None:
 
 
 def georeference_beside(source: Path, words: str) -> Georeference:
-    """As `known_georeference`. Raises UsageError with the way out when that is unknown; words : the option that needs it."""
-    georeference = known_georeference(source)
+    """As `find_georeference`. Raises UsageError with the way out when that is unknown; words : the option that needs it."""
+    georeference = find_georeference(source)
     if georeference is not None:
         return georeference
     folder = source if source.is_dir() else source.parent
@@ -191,75 +235,3 @@ def georeference_beside(source: Path, words: str) -> Georeference:
         f"{words} needs to know where on the Earth the poses lie, and {folder} is not georeferenced: run the sequence "
         "again with --gnss or --georeference where it has fixes, or with --osm"
     )
-
-
-def convert_to_earth(
-    trajectory: Trajectory,
-    kind: str,
-    out: Path,
-    georeference: Georeference,
-    calibration: Calibration,
-    *,
-    frame: str | None = None,
-    overwrite: bool = False,
-) -> Trajectory:
-    """Write the positions of `trajectory` to `out` as `kind`, `kml` or `gpx`. Returns the written ones.
-
-    Degrees have 7 decimals (1 cm), heights above the WGS84 ellipsoid 3. Times are UTC, and left out where stamps are not
-    Unix time.
-
-    Raises
-    ------
-    OutputExistsError : `out` is there and `overwrite` is not set. UsageError : unknown `kind`, or the `frame` of a camera.
-    InputError : no pose is finite, or the change of body needs an extrinsic that `calibration` does not have.
-    """
-    if kind not in WRITERS:
-        raise UsageError(f"no format {kind!r} of map programs: {', '.join(WRITERS)} are")
-    moved = _on_earth(trajectory, kind, out, calibration, frame, overwrite)
-    places = [
-        (round(lat, 7), round(lon, 7), round(h, 3))
-        for lat, lon, h in to_lat_lon(moved.positions, georeference).tolist()
-    ]
-    name = out.stem
-    about = f"poses of {moved.frame} by lslam, heights in m above the WGS84 ellipsoid"
-    if georeference.method == "osm":
-        about += "; placed by buildings, © OpenStreetMap contributors, ODbL 1.0"
-    WRITERS[kind](out, places, utc_of(moved.stamps_ns) if moved.has_stamps else None, name, about)
-    return moved
-
-
-def convert_to_crs(
-    trajectory: Trajectory,
-    out: Path,
-    projection: Projection,
-    calibration: Calibration,
-    *,
-    frame: str | None = None,
-    overwrite: bool = False,
-) -> Trajectory:
-    """Write `trajectory` to `out` as a table in the coordinate reference system of `projection`. Returns the written one.
-
-    Rotations are about east, north and up of its grid. Raises as `convert_to_earth`, and UsageError for a coordinate reference
-    system that does not count in metres.
-    """
-    projection.check()
-    moved = _on_earth(trajectory, "csv", out, calibration, frame, overwrite)
-    moved = replace(moved, poses=projection.carry(moved.poses), covariances=None)
-    write_csv(out, moved, projection.name)
-    return moved
-
-
-def _on_earth(
-    trajectory: Trajectory, kind: str, out: Path, calibration: Calibration, frame: str | None, overwrite: bool
-) -> Trajectory:
-    """The finite poses of the body `frame`, in a world that lies on the Earth, for the new file `out`."""
-    if frame == "cam0":
-        raise UsageError(f"--frame cam0: poses of the camera have a world of their own, --to {kind} takes lidar or imu")
-    if out.exists() and not overwrite:
-        raise OutputExistsError(f"{out} exists already: choose another --out, or --overwrite it")
-    moved = change_frame(trajectory, frame or trajectory.frame, calibration)
-    moved = moved.select(np.isfinite(moved.positions).all(axis=1))
-    if not len(moved):
-        raise InputError(f"{trajectory.source} has no pose that is finite")
-    out.parent.mkdir(parents=True, exist_ok=True)
-    return moved

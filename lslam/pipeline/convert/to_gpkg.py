@@ -12,17 +12,17 @@ from xml.etree.ElementTree import Element, SubElement, tostring
 
 import numpy as np
 
-from lslam.core.errors import InputError, OutputError, OutputExistsError, UsageError, cause
+from lslam.core.errors import InputError, OutputError, UsageError, cause
 from lslam.core.extras import importing, install_hint
 from lslam.core.types.arrays import Floats
 from lslam.core.types.gnss import OutputCrs
 from lslam.io.formats.text_tables import utc_of
 from lslam.maps.georeference import LocalFrame, Projection, in_crs
 from lslam.osm.buildings_geojson import read_buildings_geojson
-from lslam.pipeline.convert import staged
+from lslam.pipeline.convert import stage
 from lslam.pipeline.convert.convert_trajectory import georeference_beside
 from lslam.pipeline.rebuild import EarlierRun, covariances_of, read_run, results_of
-from lslam.pipeline.run_folder import require_run
+from lslam.pipeline.run_folder import require_new, require_run
 
 Shape = Literal["points", "lines", "polygons"]
 Value = int | float | str | datetime | None
@@ -30,6 +30,7 @@ _SYMBOLS = {"points": ("marker", "SimpleMarker"), "lines": ("line", "SimpleLine"
 _GREEN, _ORANGE, _GREY, _BLUE, _RED = "#2e7d32", "#ef6c00", "#9e9e9e", "#1565c0", "#c62828"
 _SCANS = {"ok": _GREEN, "bridged": _ORANGE, "skipped": _GREY}
 _BUILDINGS = {"seen": _GREEN, "unseen": _GREY, "absent": _RED}
+SUFFIX = ".gpkg"
 
 
 @dataclass(frozen=True)
@@ -166,9 +167,6 @@ def _style(layer: GeoLayer) -> str:
     return "<!DOCTYPE qgis>" + tostring(root, encoding="unicode")
 
 
-SUFFIX = ".gpkg"
-
-
 def convert_to_gpkg(
     folder: Path, out: Path, *, crs: OutputCrs | None = None, overwrite: bool = False
 ) -> list[GeoLayer]:
@@ -185,18 +183,16 @@ def convert_to_gpkg(
     """
     if out.suffix != SUFFIX:
         raise UsageError(f"--out {out}: a GeoPackage is one file, its name ends in {SUFFIX}")
-    if out.exists() and not overwrite:
-        raise OutputExistsError(f"{out} exists already: choose another --out, or --overwrite it")
+    require_new(out, overwrite)
     require_run(folder)
     projection = Projection(in_crs(georeference_beside(folder, "--to gpkg"), crs))
     projection.check()
     run = read_run(folder)
     if not len(run.trajectory):
         raise InputError(f"{folder / 'trajectory.tum'} has no pose")
-    name = str(run.manifest.get("sequence", {}).get("name", run.folder.name))
-    layers = pose_layers({name: run}, projection) + building_layers(folder, projection)
-    with staged(out) as made:
-        write_gpkg(made, layers, projection)
+    layers = pose_layers({run.name: run}, projection) + building_layers(folder, projection)
+    with stage(out) as path:
+        write_gpkg(path, layers, projection)
     return layers
 
 
@@ -247,29 +243,29 @@ def building_layers(folder: Path, projection: Projection) -> list[GeoLayer]:
     """Layers of buildings at their georeferenced places, as in buildings.geojson of the run's folder; none without it."""
     if not (folder / "buildings.geojson").is_file():
         return []
-    found = read_buildings_geojson(folder / "buildings.geojson")
+    corrections = read_buildings_geojson(folder / "buildings.geojson")
     # Buildings lie in the local frame of their own origin.
     there = Projection(
-        replace(projection.georeference, origin=found.origin, T_enu_world=np.eye(4), epsg=projection.epsg)
+        replace(projection.georeference, origin=corrections.origin, T_enu_world=np.eye(4), epsg=projection.epsg)
     )
-    about = f"{found.attribution}; corrected by lslam" if found.attribution else "corrected by lslam"
-    held = found.buildings
+    about = f"{corrections.attribution}; corrected by lslam" if corrections.attribution else "corrected by lslam"
+    buildings = corrections.buildings
     polygons = [
         [[_close_ring(ring, there) for ring in footprint.rings] for footprint in c.real_building.footprints]
-        for c in held
+        for c in buildings
     ]
     columns: dict[str, Any] = {
-        "osm_id": [c.building.osm_id for c in held],
-        "status": [c.status for c in held],
-        "displacement_east_m": [float(c.displacement[0]) for c in held],
-        "displacement_north_m": [float(c.displacement[1]) for c in held],
-        "turn_deg": [float(np.degrees(c.displacement[2])) for c in held],
-        "confidence": [c.confidence for c in held],
-        "height_m": [c.building.height for c in held],
-        "name": [c.building.tags.get("name") for c in held],
+        "osm_id": [c.building.osm_id for c in buildings],
+        "status": [c.status for c in buildings],
+        "displacement_east_m": [float(c.displacement[0]) for c in buildings],
+        "displacement_north_m": [float(c.displacement[1]) for c in buildings],
+        "turn_deg": [float(np.degrees(c.displacement[2])) for c in buildings],
+        "confidence": [c.confidence for c in buildings],
+        "height_m": [c.building.height for c in buildings],
+        "name": [c.building.tags.get("name") for c in buildings],
     }
-    walls = [_projected(wall, there) for wall in found.new_walls]
-    lengths = np.linalg.norm(found.new_walls[:, 1] - found.new_walls[:, 0], axis=1).tolist()
+    walls = [_project(wall, there) for wall in corrections.new_walls]
+    lengths = np.linalg.norm(corrections.new_walls[:, 1] - corrections.new_walls[:, 0], axis=1).tolist()
     return [
         GeoLayer("buildings", "polygons", polygons, columns, about, _BUILDINGS),
         GeoLayer(
@@ -283,10 +279,10 @@ def building_layers(folder: Path, projection: Projection) -> list[GeoLayer]:
     ]
 
 
-def _projected(points: Floats, projection: Projection) -> Floats:
+def _project(points: Floats, projection: Projection) -> Floats:
     """Positions (K, 2), m, as (K, 3) projected coordinates, at the height of the origin."""
     return projection.apply(np.column_stack([points, np.zeros(len(points))]))
 
 
 def _close_ring(ring: Floats, projection: Projection) -> Floats:
-    return _projected(np.concatenate([ring, ring[:1]]), projection)[:, :2]
+    return _project(np.concatenate([ring, ring[:1]]), projection)[:, :2]

@@ -1,10 +1,12 @@
-"""A finished run, or a merge of several, as it is delivered: its drives, coordinates, and surveyed points beside its poses."""
+"""A finished run, or a merge of several, as it is delivered: drives, coordinates, surveyed points; and sentences about it."""
 
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping
+import textwrap
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,23 +14,27 @@ import numpy as np
 
 from lslam.backend.control_points import control_residuals
 from lslam.backend.manual import read_control_points, require_instants
+from lslam.core import __version__
 from lslam.core.errors import InputError, RunFailedError, UsageError, input_errors
 from lslam.core.geometry import geodesy, noise, se3
-from lslam.core.printable import first_of
+from lslam.core.printable import count_of, first_of, with_decimals
 from lslam.core.types.arrays import Floats
 from lslam.core.types.gnss import OutputCrs
 from lslam.core.untrusted import MISFIT
+from lslam.io.formats.text_tables import utc_of
 from lslam.io.formats.trajectory_files import read_trajectory
 from lslam.maps.georeference import LocalFrame, Projection, in_crs
 from lslam.pipeline.map_files import georeference_of, read_json
 from lslam.pipeline.rebuild import EarlierRun, covariances_of, read_run, results_of
 from lslam.pipeline.run_folder import MANIFEST, SESSIONS, require_run
 
-FINISHED = ("done", "degraded")
+DELIVERABLE = ("done", "degraded")
 # Surveys of one mark differ by less, two marks by more.
 SAME_MARK_M = 0.05
 # Of a length. Grids that states survey in are true to 1 in 1,000, web maps to no bound.
 MOST_SCALE_ERROR = 0.01
+TITLE = "Delivery of a LiDAR survey by lslam"
+_WIDTH = 100
 
 
 @dataclass(frozen=True)
@@ -101,11 +107,11 @@ class Survey:
         return np.asarray(np.sqrt(np.maximum(variances, 0.0)))
 
 
-def read_survey(folder: Path, crs: OutputCrs | None, check: Path | None = None, is_forced: bool = False) -> Survey:
+def read_survey(folder: Path, crs: OutputCrs | None, check: Path | None = None, takes_any: bool = False) -> Survey:
     """Read what a run or a merge left in `folder`.
 
     crs : coordinates to deliver in, None for those of the run; check : file of points that the run did not use
-    is_forced : whether a run that diverged or was interrupted is read too
+    takes_any : whether a run that diverged or was interrupted is read too
 
     Raises
     ------
@@ -114,10 +120,10 @@ def read_survey(folder: Path, crs: OutputCrs | None, check: Path | None = None, 
     """
     require_run(folder)
     manifest = read_json(folder / MANIFEST)
-    why = "" if (status := str(manifest.get("status", "unknown"))) in FINISHED else f"it is {status}"
+    why = "" if (status := str(manifest.get("status", "unknown"))) in DELIVERABLE else f"it is {status}"
     if any(part.get("frame") for part in manifest.get("segments", ())):
         why = why or "scans of it lie in a frame of their own, at no known place"
-    if why and not is_forced:
+    if why and not takes_any:
         raise RunFailedError(
             f"{folder} is no result to hand over, {why}: run the sequence again, or take it as it is with --anyway"
         )
@@ -144,17 +150,17 @@ def read_survey(folder: Path, crs: OutputCrs | None, check: Path | None = None, 
             "survey; leave --crs out for that of the run, or name one made for this place"
         )
     survey = Survey(folder, manifest, drives, projection)
-    used = _control(survey, projection)
-    points = [] if used is None else [used]
+    control = _control(survey, projection)
+    points = [] if control is None else [control]
     if check is not None:
-        points.append(_checked(survey, projection, check, used))
+        points.append(_check_points(survey, projection, check, control))
     return replace(survey, points=tuple(points))
 
 
 def _drives(folder: Path, manifest: Mapping[str, Any]) -> dict[str, EarlierRun]:
     if manifest.get("kind") != "merge":
         run = read_run(folder)
-        return {str(run.manifest.get("sequence", {}).get("name", folder.name)): run}
+        return {run.name: run}
     georeference, drives = georeference_of(manifest.get("georeference")), {}
     try:
         sessions = [(str(row["name"]), Path(row["run"])) for row in manifest["sessions"]]
@@ -190,7 +196,7 @@ def _control(survey: Survey, projection: Projection) -> SurveyedPoints | None:
     return _points("used", names, stamps, places, residuals, projection) if rows else None
 
 
-def _checked(survey: Survey, projection: Projection, path: Path, used: SurveyedPoints | None) -> SurveyedPoints:
+def _check_points(survey: Survey, projection: Projection, path: Path, control: SurveyedPoints | None) -> SurveyedPoints:
     """Points of a person that the run did not use, beside its final poses."""
     if len(survey.drives) > 1:
         raise UsageError(
@@ -199,16 +205,16 @@ def _checked(survey: Survey, projection: Projection, path: Path, used: SurveyedP
     (run,) = survey.drives.values()
     points, results = read_control_points(path), results_of(run)
     require_instants([point.at for point in points], np.array([r.index for r in results]), run.trajectory.stamps_ns)
-    found = control_residuals(points, results, projection.georeference, projection.georeference.geoid)
-    names, stamps = [point.at.source for point in points], [one.stamp_ns for one in found]
-    places, residuals = np.stack([one.place for one in found]), np.stack([one.residual for one in found])
-    checked = _points("kept out", names, stamps, places, residuals, projection)
-    for name, place in zip(names, checked.places, strict=True):
-        if used is not None and (np.linalg.norm(used.places[:, :2] - place[:2], axis=1) < SAME_MARK_M).any():
+    off = control_residuals(points, results, projection.georeference, projection.georeference.geoid)
+    names, stamps = [point.at.source for point in points], [one.stamp_ns for one in off]
+    places, residuals = np.stack([one.place for one in off]), np.stack([one.residual for one in off])
+    result = _points("kept out", names, stamps, places, residuals, projection)
+    for name, place in zip(names, result.places, strict=True):
+        if control is not None and (np.linalg.norm(control.places[:, :2] - place[:2], axis=1) < SAME_MARK_M).any():
             raise UsageError(
                 f"--check: {name} is a control point that held the run: it checks nothing; leave it out of one file"
             )
-    return checked
+    return result
 
 
 def _points(
@@ -222,5 +228,142 @@ def _points(
     """From places lat, lon (deg), height (m), and residuals (N, 3) east, north, up, m."""
     there = projection.georeference
     enu = geodesy.to_local(places, there.origin)
-    surveyed, solved = (projection.apply(se3.apply(se3.inverse(there.T_enu_world), at)) for at in (enu, enu - off))
-    return SurveyedPoints(kind, names, stamps, surveyed, surveyed - solved)
+    stated, solved = (projection.apply(se3.apply(se3.inverse(there.T_enu_world), at)) for at in (enu, enu - off))
+    return SurveyedPoints(kind, names, stamps, stated, stated - solved)
+
+
+def accuracy(survey: Survey) -> list[str]:
+    """What was measured of the accuracy, by points kept out and by those that were used, and the internal precision."""
+    by_kind = {points.kind: points for points in survey.points}
+    sentences = []
+    if (check := by_kind.get("kept out")) is not None:
+        sentences.append(
+            f"Measured at {count_of(len(check.names), 'check point')} that the run did not use: RMS {_pair(check.rms)}, "
+            f"largest {_pair(check.worst)}."
+        )
+    else:
+        sentences.append("Accuracy was not measured: no check point was kept out of the run.")
+    if (control := by_kind.get("used")) is not None:
+        sentences.append(
+            f"{count_of(len(control.names), 'control point')} held the run: residuals of RMS {_pair(control.rms)}, largest "
+            f"{_pair(control.worst)}. They say how well the trajectory follows these points, not how accurate it is elsewhere."
+        )
+        facts = survey.manifest.get("graph", {}).get("control_points", {})
+        if facts.get("redundancy") == 0 or facts.get("height_redundancy") == 0:
+            sentences.append("So few points have no redundancy: nothing but odometry checks them.")
+    sentences += _fixes(survey)
+    if len(sigmas := survey.sigmas):
+        middle, worst = np.median(sigmas, axis=0), sigmas.max(axis=0)
+        sentences.append(
+            f"One standard deviation by the covariances, {precision_note(survey)}: {_pair(middle)} in the median, {_pair(worst)} "
+            "at most. Systematic errors are not in it."
+        )
+    else:
+        sentences.append("No covariances are known of these poses: nothing is said of their precision.")
+    return sentences
+
+
+def precision_note(survey: Survey) -> str:
+    """What standard deviations of the poses are relative to, in words."""
+    georeference = next(iter(survey.drives.values())).georeference
+    is_absolute = georeference is not None and georeference.is_in_graph
+    return "internal precision " + ("in the delivered coordinates" if is_absolute else "relative to the first pose")
+
+
+def _pair(values: Any) -> str:
+    return f"{with_decimals(float(values[0]), 3)} m horizontally, {with_decimals(float(values[1]), 3)} m vertically"
+
+
+def _fixes(survey: Survey) -> list[str]:
+    """Sentence about satellite fixes, where a run has used some."""
+    facts = survey.manifest.get("georeference", {})
+    if not (facts.get("fixes") and facts.get("used")):
+        return []
+    how = "held the run" if facts["method"] == "graph" else "placed the finished trajectory"
+    rms = [float(facts.get(name, "nan")) for name in ("rmse_horizontal", "rmse_vertical")]
+    return [f"{facts['used']} of {facts['fixes']} satellite fixes {how}; the antenna is RMS {_pair(rms)} from them."]
+
+
+def coordinates(survey: Survey) -> list[str]:
+    """The coordinate reference system, its heights, the transformation and the epoch."""
+    frame = survey.frame
+    if not isinstance(frame, Projection):
+        return [
+            f"Local coordinates, m, not georeferenced: {frame.frame.partition(': ')[2]}. x and y have no relation to north, "
+            "heights none to any datum."
+        ]
+    is_ellipsoidal = "ellipsoid" in frame.heights
+    kind = "ellipsoidal heights, no geoid was applied" if is_ellipsoidal else "physical heights, by a geoid"
+    return [
+        f"{frame.name}: {frame.plane}.",
+        f"{frame.heights[0].upper()}{frame.heights[1:]}: {kind}.",
+        f"From WGS 84 by PROJ: {frame.operation}.",
+        _north(frame),
+        f"Epoch: {epoch(survey)}.",
+        *([f"{frame.attribution[0].upper()}{frame.attribution[1:]}."] if frame.attribution else []),
+    ]
+
+
+def epoch(survey: Survey) -> str:
+    """When the recording was made, as a date and a year with decimals; or that nobody knows."""
+    times = utc_of(next(iter(survey.drives.values())).trajectory.stamps_ns)
+    if times is None:
+        return "unknown, stamps of the recording are no Unix time"
+    begin = datetime(times[0].year, 1, 1, tzinfo=UTC)
+    share = (times[0] - begin) / (datetime(times[0].year + 1, 1, 1, tzinfo=UTC) - begin)
+    return f"{times[0]:%Y-%m-%d}, {times[0].year + share:.2f}, when it was recorded"
+
+
+def _north(projection: Projection) -> str:
+    """Directions of grid north and true north, and the scale."""
+    convergence, scale = projection.convergence_and_scale
+    side = "east" if convergence > 0 else "west"
+    return f"N is grid north, {abs(convergence):.3f} deg {side} of true north; scale of the grid {scale:.6f}."
+
+
+def limits(survey: Survey) -> list[str]:
+    """What a user of the data must know: how the run ended, and why."""
+    if survey.status == "done":
+        return ["The run ended as done.", *survey.problems]
+    warning = ": this is no finished result, and was delivered on request (--anyway)"
+    return [f"The run is {survey.status}{'' if survey.status in DELIVERABLE else warning}.", *survey.problems]
+
+
+def making(survey: Survey) -> list[str]:
+    """Input, method, version and command."""
+    manifest, scans = survey.manifest, sum(len(run.trajectory) for run in survey.drives.values())
+    run = next(iter(survey.drives.values()))
+    count = sum(status == "ok" for one in survey.drives.values() for status in one.statuses)
+    length = sum(float(one.trajectory.path_lengths[-1]) for one in survey.drives.values())
+    return [
+        f"Recording: {survey.name}; {count_of(scans, 'scan')}, {count} registered; {length:.1f} m of way.",
+        f"Method: {run.config.odometry.method}, lslam {manifest.get('lslam', 'of unknown version')}; "
+        f"{count_of(int(manifest.get('graph', {}).get('loops', 0)), 'loop closure')}.",
+        *([f"Processed: {str(manifest['written'])[:10]}."] if "written" in manifest else []),
+    ]
+
+
+def readme(survey: Survey, files: Mapping[str, str], notes: Sequence[str], command: str) -> str:
+    """README.txt: files by name with what they are, and all of the above; notes : what is missing, and why."""
+    sections: dict[str, Sequence[str]] = {
+        "Coordinates": coordinates(survey),
+        "Accuracy": accuracy(survey),
+        "Limits": [*limits(survey), *notes],
+        "How it was made": [
+            *making(survey),
+            f"Run by: {survey.manifest.get('command', 'unknown')}",
+            f"Delivered on {datetime.now(UTC):%Y-%m-%d} with lslam {__version__} by: {command}",
+        ],
+    }
+    lines = [TITLE, "=" * len(TITLE), ""]
+    lines += [*_paragraph(f"Survey of {survey.name}. Every length is in metres."), "", "Files", "-----"]
+    width = max(map(len, files))
+    for name, about in files.items():
+        lines += textwrap.wrap(about, _WIDTH, initial_indent=f"{name:<{width}}  ", subsequent_indent=" " * (width + 2))
+    for heading, texts in sections.items():
+        lines += ["", heading, "-" * len(heading), *(line for text in texts for line in _paragraph(text))]
+    return "\n".join(lines) + "\n"
+
+
+def _paragraph(text: str) -> list[str]:
+    return textwrap.wrap(text, _WIDTH, break_long_words=False, break_on_hyphens=False)

@@ -23,6 +23,9 @@ class Finding:
         return f"{self.what}: {self.way_out}" if self.way_out else self.what
 
 
-def plural(count: int, noun: str, several: str = "") -> str:
-    """Count with its noun: `1 gap`, `2 gaps`."""
-    return f"{count} {noun if count == 1 else several or noun + 's'}"
+class Findings(list[Finding]):
+    """Faults of a recording, in the order in which they are found."""
+
+    def add(self, code: str, what: str, way_out: str = "") -> None:
+        """Append a finding."""
+        self.append(Finding(code, what, way_out))

@@ -12,13 +12,14 @@ from lslam.core.config import Config
 from lslam.core.errors import InputError
 from lslam.core.geometry import portable, se3
 from lslam.core.geometry.se3 import ContinuousMotion
+from lslam.core.printable import count_of
 from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.camera import Camera, Image, cameras_of
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
 from lslam.core.types.sequence import Sequence
 from lslam.odometry.frontend.inertial_start import first_poses
-from lslam.pipeline.doctor import Facts, Finding, plural
+from lslam.pipeline.doctor import Facts, Findings
 from lslam.registration.preprocessing.deskew import deskew_points, knots_over
 from lslam.registration.preprocessing.views import with_rings
 
@@ -46,7 +47,7 @@ class Offset:
     beams: Floats
 
 
-def examine_cameras(sequence: Sequence, findings: list[Finding]) -> list[Facts]:
+def examine_cameras(sequence: Sequence, findings: Findings) -> list[Facts]:
     """Facts about each camera, with its offset in the first scans, which are registered for it.
 
     sequence : with per-point times. Raises InputError where there is no camera, as `cameras_of`.
@@ -61,7 +62,7 @@ def examine_cameras(sequence: Sequence, findings: list[Finding]) -> list[Facts]:
     try:
         ringed = with_rings(sequence)
     except InputError as error:
-        findings.append(Finding("camera-rings", f"cameras cannot be checked: {error}"))
+        findings.add("camera-rings", f"cameras cannot be checked: {error}")
         return [_facts(camera, None) for camera in cameras]
     facts = []
     for camera in cameras:
@@ -93,24 +94,20 @@ def _facts(camera: Camera, offset: Offset | None) -> Facts:
     }
 
 
-def _judge(name: str, offset: Offset, findings: list[Finding]) -> None:
+def _judge(name: str, offset: Offset, findings: Findings) -> None:
     if np.any(np.abs(offset.pixels) > np.maximum(_SURE * offset.pixels_sigma, np.maximum(offset.beams, 1.0))):
         right, down = offset.pixels
-        findings.append(
-            Finding(
-                "camera-pixels",
-                f"camera {name}: edges of its images lie {right:+.1f} px right of and {down:+.1f} px below those of depth",
-                "look at its extrinsics (T_lidar_camera) and intrinsics",
-            )
+        findings.add(
+            "camera-pixels",
+            f"camera {name}: edges of its images lie {right:+.1f} px right of and {down:+.1f} px below those of depth",
+            "look at its extrinsics (T_lidar_camera) and intrinsics",
         )
     if abs(offset.time_s) > max(_SURE * offset.time_sigma_s, _STEP_S):
-        findings.append(
-            Finding(
-                "camera-clock",
-                f"camera {name}: its images fit the scans {abs(offset.time_s):.3f} s "
-                f"{'later' if offset.time_s > 0 else 'earlier'} than their stamps say",
-                f"time_offset_s = {offset.time_s:.3f} in its table of sequence.toml",
-            )
+        findings.add(
+            "camera-clock",
+            f"camera {name}: its images fit the scans {abs(offset.time_s):.3f} s "
+            f"{'later' if offset.time_s > 0 else 'earlier'} than their stamps say",
+            f"time_offset_s = {offset.time_s:.3f} in its table of sequence.toml",
         )
 
 
@@ -235,7 +232,7 @@ def sentence_of(facts: Facts) -> str:
     """A camera in words."""
     rate = "" if facts["rate_hz"] is None else f", {facts['rate_hz']:.1f} Hz"
     width, height = facts["size"]
-    text = f"{facts['name']}: {plural(facts['images'], 'image')} of {width} x {height}{rate}, {facts['model']}"
+    text = f"{facts['name']}: {count_of(facts['images'], 'image')} of {width} x {height}{rate}, {facts['model']}"
     offset = facts["offset"]
     if offset is None:
         return f"{text}; edges of depth and of images could not be compared"

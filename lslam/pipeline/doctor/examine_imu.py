@@ -6,12 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lslam.core.printable import count_of
 from lslam.core.types.arrays import Floats
 from lslam.core.types.imu import GRAVITY, ImuStream
 from lslam.core.types.sequence import Sequence, no_shared_time
 from lslam.odometry.inertial.imu_cleaning import LEAST_RATE_HZ, gravity_unit, is_slow, mean_forces, rate_of
 from lslam.odometry.inertial.initialise import STILL_FORCE, STILL_RATE
-from lslam.pipeline.doctor import Facts, Finding, plural
+from lslam.pipeline.doctor import Facts, Finding, Findings
 
 # s of standing: white noise is read off the Allan deviation from the first on, where that has its least from the second.
 _WHITE_S, _STABLE_S = 10.0, 120.0
@@ -142,7 +143,7 @@ _TILT_DEG = 35.0
 _GAP_S = 0.1
 
 
-def examine_imu(sequence: Sequence, findings: list[Finding]) -> Facts | None:
+def examine_imu(sequence: Sequence, findings: Findings) -> Facts | None:
     """Facts of the IMU, None when there is none."""
     imu = sequence.imu
     if imu is None or not len(imu):
@@ -150,7 +151,7 @@ def examine_imu(sequence: Sequence, findings: list[Finding]) -> Facts | None:
     finite = np.isfinite(np.hstack([imu.accel, imu.gyro])).all(axis=1)
     if not finite.all():
         what = f"IMU: {int((~finite).sum())} of {len(imu)} samples are not finite"
-        findings.append(Finding("imu-finite", what, "lslam leaves out a tenth at most and refuses the IMU beyond"))
+        findings.add("imu-finite", what, "lslam leaves out a tenth at most and refuses the IMU beyond")
     steps = np.diff(imu.stamps_ns) * 1e-9
     median = float(np.median(steps)) if len(steps) else 0.0
     facts: Facts = {
@@ -169,62 +170,54 @@ def examine_imu(sequence: Sequence, findings: list[Finding]) -> Facts | None:
     )
 
 
-def _examine_time(sequence: Sequence, imu: ImuStream, steps: Floats, median: float, findings: list[Finding]) -> int:
+def _examine_time(sequence: Sequence, imu: ImuStream, steps: Floats, median: float, findings: Findings) -> int:
     """Check rate, order, gaps and overlap. Returns the number of gaps."""
     if median > 0 and is_slow(1 / median):
         what = f"IMU: {1 / median:.1f} Hz, too slow to see shaking within a scan ({LEAST_RATE_HZ:.0f} Hz would do)"
-        findings.append(Finding("imu-rate", what, "record it faster, of KITTI raw take the `_extract` drive (100 Hz)"))
+        findings.add("imu-rate", what, "record it faster, of KITTI raw take the `_extract` drive (100 Hz)")
     back = int((steps <= 0).sum())
     if back:
-        what = f"IMU: time repeats or goes back {plural(back, 'time')}"
-        findings.append(
-            Finding("imu-rewinds", what, "lslam leaves those samples out; correct the stamps if they are many")
-        )
+        what = f"IMU: time repeats or goes back {count_of(back, 'time')}"
+        findings.add("imu-rewinds", what, "lslam leaves those samples out; correct the stamps if they are many")
     gaps = int((steps > _GAP_S + 0.5 * median).sum())
     if gaps:
-        what = f"IMU: {plural(gaps, 'gap')}, the longest {steps.max():.3f} s"
-        findings.append(Finding("imu-gaps", what, "scans within them are predicted by constant velocity"))
+        what = f"IMU: {count_of(gaps, 'gap')}, the longest {steps.max():.3f} s"
+        findings.add("imu-gaps", what, "scans within them are predicted by constant velocity")
     apart = no_shared_time("IMU")
     first, last = sequence.stamps_ns[0], sequence.stamps_ns[-1]
     if apart not in sequence.problems and (imu.stamps_ns[0] > last or imu.stamps_ns[-1] < first):
         ahead = (imu.stamps_ns[0] - first) * 1e-9
-        findings.append(
-            Finding(
-                "imu-apart",
-                f"{apart}, it begins {ahead:+.3f} s from the first",
-                "correct its stamps or set imu.time_offset_s",
-            )
+        findings.add(
+            "imu-apart",
+            f"{apart}, it begins {ahead:+.3f} s from the first",
+            "correct its stamps or set imu.time_offset_s",
         )
     return gaps
 
 
-def _examine_extrinsics(sequence: Sequence, findings: list[Finding]) -> None:
+def _examine_extrinsics(sequence: Sequence, findings: Findings) -> None:
     """Check for extrinsics that are missing, or that the reader of a bag assumed."""
     if sequence.calibration.T_lidar_imu is None:
-        findings.append(
-            Finding(
-                "imu-extrinsics",
-                "IMU: T_lidar_imu is not known, it is taken to sit in the LiDAR with the same axes",
-                "give --extrinsics, or T_lidar_imu below [extrinsics] in sequence.toml",
-            )
+        findings.add(
+            "imu-extrinsics",
+            "IMU: T_lidar_imu is not known, it is taken to sit in the LiDAR with the same axes",
+            "give --extrinsics, or T_lidar_imu below [extrinsics] in sequence.toml",
         )
 
 
-def _examine_gravity(imu: ImuStream, T_lidar_imu: Floats | None, findings: list[Finding]) -> Facts:
+def _examine_gravity(imu: ImuStream, T_lidar_imu: Floats | None, findings: Findings) -> Facts:
     """Check the unit of the specific force and the up direction in the LiDAR's frame, which is +z if all is right."""
     if not len(imu):
         return {"gravity_norm": 0.0, "gravity_unit": None, "up_in_lidar": None, "tilt_deg": None}
     calm, unit = gravity_unit(imu) if len(imu) > 1 else (float(np.linalg.norm(imu.accel[0])), None)
     norm = float(np.linalg.norm(imu.accel.mean(axis=0)))
     if unit != "m/s2":
-        findings.append(
-            Finding(
-                "imu-accel-unit",
-                f"IMU: the mean specific force is {norm:.2f} ({calm:.2f} when calm), not about 9.81 (m/s2)",
-                f"it seems to be in g, multiply by {GRAVITY} (a run does, and says so)"
-                if unit == "g"
-                else "not usable as it is, check its unit and that gravity was not taken off",
-            )
+        findings.add(
+            "imu-accel-unit",
+            f"IMU: the mean specific force is {norm:.2f} ({calm:.2f} when calm), not about 9.81 (m/s2)",
+            f"it seems to be in g, multiply by {GRAVITY} (a run does, and says so)"
+            if unit == "g"
+            else "not usable as it is, check its unit and that gravity was not taken off",
         )
     if unit is None:
         return {"gravity_norm": norm, "gravity_unit": None, "up_in_lidar": None, "tilt_deg": None}
@@ -257,10 +250,10 @@ def _tilt(up: Floats, tilt: float) -> Finding:
     return Finding("imu-gravity", what, way)
 
 
-def _examine_gyro(imu: ImuStream, findings: list[Finding]) -> Facts:
+def _examine_gyro(imu: ImuStream, findings: Findings) -> Facts:
     rates = np.linalg.norm(imu.gyro, axis=1)
     median = float(np.median(rates)) if len(rates) else 0.0
     if median > _TURNING:
         what = f"IMU: half of the rates are above {median:.1f} rad/s ({np.degrees(median):.0f} deg/s)"
-        findings.append(Finding("imu-gyro-unit", what, "they seem to be in deg/s, convert them to rad/s"))
+        findings.add("imu-gyro-unit", what, "they seem to be in deg/s, convert them to rad/s")
     return {"gyro_median_deg_s": float(np.degrees(median))}

@@ -18,7 +18,7 @@ from lslam.odometry.inertial.agreement import FAR_S, LEAST_TURNING, NEAR_S, STEP
 from lslam.odometry.inertial.fusion import InertialMotion
 from lslam.odometry.inertial.imu_cleaning import CleanStream, ImuFault, ImuRefusedError, clean
 from lslam.odometry.inertial.initialise import FirstPoses, start, told_poses
-from lslam.pipeline.doctor import Facts, Finding
+from lslam.pipeline.doctor import Facts, Finding, Findings
 
 log = logging.getLogger("lslam")
 
@@ -36,31 +36,31 @@ _LEAST_ANGLE = np.deg2rad(8.0)
 _HOPELESS = {"imu-accel-unit", "imu-apart", "imu-finite"}
 
 
-def examine_turns(sequence: Sequence, findings: list[Finding]) -> Facts | None:
+def examine_turns(sequence: Sequence, findings: Findings) -> Facts | None:
     """Register the first scans with `icp` and compare their rotations with the gyroscope's; None without an IMU."""
     imu, stamps_ns = sequence.imu, sequence.stamps_ns
     if imu is None or not len(imu) or len(sequence) < _FEWEST:
         return None
     try:
-        cleaned = clean(imu, int(stamps_ns[0]), int(stamps_ns[-1]))
+        stream = clean(imu, int(stamps_ns[0]), int(stamps_ns[-1]))
     except ImuRefusedError as error:
         if not _HOPELESS & {f.code for f in findings}:
             way_out = error.way_out or "it holds no measurements; look at its driver, and run without --imu"
-            findings.append(Finding("imu-refused", f"IMU: {error.what}", way_out))
+            findings.add("imu-refused", f"IMU: {error.what}", way_out)
         return None
     log.info("registering the first %d scans to compare their turns with the IMU's", min(_SCANS, len(sequence)))
     seconds = float(np.clip(_SCANS / sequence.rate_hz, 0.5, 60))
     config = Config.model_validate({"imu": {"start_s": seconds}})
     try:
-        first, _ = told_poses(first_poses(sequence, config, None), cleaned.imu)
+        first, _ = told_poses(first_poses(sequence, config, None), stream.imu)
     except ImuRefusedError:
         return None  # gaps everywhere, which are found by now
     if len(first.instants_ns) < _FEWEST:
         return None
     known = sequence.calibration.T_lidar_imu
     T_lidar_imu = np.eye(4) if known is None else known
-    first = _swept_by_imu(sequence, cleaned.imu, T_lidar_imu, first, config)
-    return compare(cleaned, T_lidar_imu, first.instants_ns, first.middles, findings)
+    first = _swept_by_imu(sequence, stream.imu, T_lidar_imu, first, config)
+    return compare(stream, T_lidar_imu, first.instants_ns, first.middles, findings)
 
 
 def _swept_by_imu(
@@ -80,65 +80,67 @@ def _swept_by_imu(
     return again if len(again.instants_ns) >= _FEWEST else first
 
 
-def compare(
-    cleaned: CleanStream, T_lidar_imu: Floats, stamps_ns: Longs, poses: Floats, findings: list[Finding]
-) -> Facts:
+def compare(stream: CleanStream, T_lidar_imu: Floats, stamps_ns: Longs, poses: Floats, findings: Findings) -> Facts:
     """Compare the gyroscope with the LiDAR's poses (N, 4, 4) at `stamps_ns` (N,)."""
     agreement = Agreement(False)
     refusal: ImuRefusedError | None = None
     try:
-        agreement = check_agreement(cleaned.imu, T_lidar_imu, stamps_ns, poses, None)
+        agreement = check_agreement(stream.imu, T_lidar_imu, stamps_ns, poses, None)
     except ImuRefusedError as error:
         refusal = error
     if refusal or (agreement.is_judged and agreement.correlation < _SURE):
-        far = _far_off(cleaned, T_lidar_imu, stamps_ns, poses, agreement)
+        far = _far_off(stream, T_lidar_imu, stamps_ns, poses, agreement)
         if far is not None:
             agreement, refusal = far, None
-    seen, felt = turns(cleaned.imu, T_lidar_imu, stamps_ns, poses, agreement.offset_s)
+    lidar_rates, imu_rates = turns(stream.imu, T_lidar_imu, stamps_ns, poses, agreement.offset_s)
     # In the axes of the IMU, which its user can name.
     R = T_lidar_imu[:3, :3]
-    found = _examine_axes(seen @ R, felt @ R, R) if len(seen) and (agreement.is_judged or refusal) else None
+    found = (
+        _examine_axes(lidar_rates @ R, imu_rates @ R, R)
+        if len(lidar_rates) and (agreement.is_judged or refusal)
+        else None
+    )
     if found is not None:
         findings.append(found[0])
-        agreement = _with_axes(cleaned, found[1], stamps_ns, poses)
+        agreement = _with_axes(stream, found[1], stamps_ns, poses)
     elif refusal and not any(f.code == "imu-gyro-unit" for f in findings):
         code = "imu-gyro-unit" if refusal.fault is ImuFault.GYRO_IN_DEGREES else "imu-turns"
-        findings.append(Finding(code, f"IMU: {refusal.what}", refusal.way_out))
-    offset, sigma = _examine_clock(agreement, cleaned.rate_hz, findings), float(agreement.offset_sigma_s)
+        findings.add(code, f"IMU: {refusal.what}", refusal.way_out)
+    offset, sigma = _examine_clock(agreement, stream.rate_hz, findings), float(agreement.offset_sigma_s)
     return {
         "scans": len(stamps_ns),
         "is_judged": bool(agreement.is_judged or refusal or found),
         "correlation": float(agreement.correlation) if agreement.is_judged and found is None else None,
-        "correlation_xyz": _by_axis(seen @ R, felt @ R),
+        "correlation_xyz": _by_axis(lidar_rates @ R, imu_rates @ R),
         "time_offset_s": offset,
         "time_offset_sigma_s": sigma if agreement.is_judged and np.isfinite(sigma) else None,
     }
 
 
-def _with_axes(cleaned: CleanStream, R: Floats, stamps_ns: Longs, poses: Floats) -> Agreement:
+def _with_axes(stream: CleanStream, R: Floats, stamps_ns: Longs, poses: Floats) -> Agreement:
     """Agreement after correcting the axes by R, which may be a reflection; before, the clock offset is unobservable."""
     T = np.eye(4)
     T[:3, :3] = R
     try:
-        return check_agreement(cleaned.imu, T, stamps_ns, poses, None)
+        return check_agreement(stream.imu, T, stamps_ns, poses, None)
     except ImuRefusedError:
         return Agreement(False)
 
 
 def _far_off(
-    cleaned: CleanStream, T_lidar_imu: Floats, stamps_ns: Longs, poses: Floats, near: Agreement
+    stream: CleanStream, T_lidar_imu: Floats, stamps_ns: Longs, poses: Floats, near: Agreement
 ) -> Agreement | None:
     """Agreement at an offset beyond those that a run tries, if clearly better than `near`; else None."""
     best, at = 0.0, 0.0
     for offset in np.arange(-FAR_S, FAR_S, 4 * STEP_S):
-        seen, felt = turns(cleaned.imu, T_lidar_imu, stamps_ns, poses, float(offset))
-        both = float(np.sqrt(np.sum(seen**2) * np.sum(felt**2)))
-        value = float(np.sum(seen * felt)) / max(both, 1e-12)
+        lidar_rates, imu_rates = turns(stream.imu, T_lidar_imu, stamps_ns, poses, float(offset))
+        both = float(np.sqrt(np.sum(lidar_rates**2) * np.sum(imu_rates**2)))
+        value = float(np.sum(lidar_rates * imu_rates)) / max(both, 1e-12)
         if value > best:
             best, at = value, float(offset)
     if abs(at) < NEAR_S or best < _CLEAR or best < near.correlation + 0.1:
         return None
-    shifted = replace(cleaned.imu, stamps_ns=cleaned.imu.stamps_ns + round(1e9 * at))
+    shifted = replace(stream.imu, stamps_ns=stream.imu.stamps_ns + round(1e9 * at))
     try:
         fine = check_agreement(shifted, T_lidar_imu, stamps_ns, poses, None)
     except ImuRefusedError:
@@ -146,47 +148,45 @@ def _far_off(
     return replace(fine, offset_s=at + fine.offset_s)
 
 
-def _examine_clock(agreement: Agreement, rate_hz: float, findings: list[Finding]) -> float | None:
+def _examine_clock(agreement: Agreement, rate_hz: float, findings: Findings) -> float | None:
     """Time to add to the IMU's stamps, s; a finding if it matters and exceeds half a sample period."""
     if not agreement.is_judged:
         return None
     offset, sigma = float(agreement.offset_s), float(agreement.offset_sigma_s)
     if abs(offset) > max(_LEAST_OFFSET_S, 0.5 / rate_hz):
-        findings.append(
-            Finding(
-                "imu-time-offset",
-                f"IMU: its stamps are {1e3 * abs(offset):.1f} ms {'late' if offset < 0 else 'early'} (sigma "
-                f"{1e3 * sigma:.1f} ms, by the turns)",
-                f"run --imu finds and mends it, --set imu.time_offset_s={offset:.4f} states it"
-                if abs(offset) < NEAR_S
-                else f"correct them, or --set imu.time_offset_s={offset:.4f}; a run does not look so far",
-            )
+        findings.add(
+            "imu-time-offset",
+            f"IMU: its stamps are {1e3 * abs(offset):.1f} ms {'late' if offset < 0 else 'early'} (sigma "
+            f"{1e3 * sigma:.1f} ms, by the turns)",
+            f"run --imu finds and mends it, --set imu.time_offset_s={offset:.4f} states it"
+            if abs(offset) < NEAR_S
+            else f"correct them, or --set imu.time_offset_s={offset:.4f}; a run does not look so far",
         )
     return offset
 
 
-def _examine_axes(seen: Floats, felt: Floats, R_lidar_imu: Floats) -> tuple[Finding, Floats] | None:
+def _examine_axes(lidar_rates: Floats, imu_rates: Floats, R_lidar_imu: Floats) -> tuple[Finding, Floats] | None:
     """Check for swapped, inverted or rotated axes. Returns the `R_lidar_imu` (3, 3) to use.
 
-    seen, felt : (M, 3) rates of the LiDAR's and the IMU's rotation, in the IMU's axes
+    lidar_rates, imu_rates : (M, 3) rates of the LiDAR's and the IMU's rotation, in the IMU's axes
     """
-    rms = np.sqrt(np.mean(seen**2, axis=0))
-    judged = rms > LEAST_TURNING
-    norms = np.maximum(np.sqrt(np.outer(np.sum(seen**2, axis=0), np.sum(felt**2, axis=0))), 1e-12)
-    correlation = (seen.T @ felt) / norms
-    given = np.diag(correlation)[judged]
-    if not len(given):
+    rms = np.sqrt(np.mean(lidar_rates**2, axis=0))
+    turns_about = rms > LEAST_TURNING
+    norms = np.maximum(np.sqrt(np.outer(np.sum(lidar_rates**2, axis=0), np.sum(imu_rates**2, axis=0))), 1e-12)
+    correlation = (lidar_rates.T @ imu_rates) / norms
+    as_is = np.diag(correlation)[turns_about]
+    if not len(as_is):
         return None
-    P = _best_axes(correlation, judged)
-    better = np.sum(P * correlation, axis=1)[judged]
-    if given.min() < _BAD and better.min() >= _GOOD:
-        return _swap(P, float(given.min()), float(better.min()), int(judged.sum()), R_lidar_imu), R_lidar_imu @ P
-    return _rotation_fit(seen, felt, R_lidar_imu) if judged.sum() > 1 else None
+    P = _best_axes(correlation, turns_about)
+    better = np.sum(P * correlation, axis=1)[turns_about]
+    if as_is.min() < _BAD and better.min() >= _GOOD:
+        return _swap(P, float(as_is.min()), float(better.min()), int(turns_about.sum()), R_lidar_imu), R_lidar_imu @ P
+    return _rotation_fit(lidar_rates, imu_rates, R_lidar_imu) if turns_about.sum() > 1 else None
 
 
-def _best_axes(correlation: Floats, judged: Bools) -> Floats:
-    """Signed permutation (3, 3), seen = P felt, with the best correlation; identity about axes without rotation."""
-    weight = correlation * judged[:, None] + 0.01 * np.eye(3)
+def _best_axes(correlation: Floats, turns_about: Bools) -> Floats:
+    """Signed permutation (3, 3), lidar_rates = P imu_rates, with the best correlation; identity about axes without rotation."""
+    weight = correlation * turns_about[:, None] + 0.01 * np.eye(3)
     best, score = np.eye(3), -np.inf
     for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
         P = np.zeros((3, 3))
@@ -197,11 +197,11 @@ def _best_axes(correlation: Floats, judged: Bools) -> Floats:
     return best
 
 
-def _swap(P: Floats, before: float, after: float, judged: int, R_lidar_imu: Floats) -> Finding:
+def _swap(P: Floats, before: float, after: float, axes: int, R_lidar_imu: Floats) -> Finding:
     """Finding about IMU axes that fit after the signed permutation P (3, 3)."""
     names = ", ".join(("-" if row.sum() < 0 else "") + "xyz"[int(np.argmax(np.abs(row)))] for row in P)
     what = f"IMU: its axes do not fit the scans' turns, ({names}) for (x, y, z) would (correlation {after:.2f}, not {before:.2f})"
-    if judged < 2:
+    if axes < 2:
         way = "check the signs of its axes, and the rotation of T_lidar_imu"
     elif np.linalg.det(P) < 0:
         way = "an axis is mirrored, which no rotation mends: correct the signs in the recording of the IMU"
@@ -210,27 +210,30 @@ def _swap(P: Floats, before: float, after: float, judged: int, R_lidar_imu: Floa
     return Finding("imu-axes", what, way)
 
 
-def _rotation_fit(seen: Floats, felt: Floats, R_lidar_imu: Floats) -> tuple[Finding, Floats] | None:
+def _rotation_fit(lidar_rates: Floats, imu_rates: Floats, R_lidar_imu: Floats) -> tuple[Finding, Floats] | None:
     """Rotation that fits the IMU's rates to the LiDAR's, if it halves the residuals; else None."""
-    spread = np.sqrt(np.maximum(np.linalg.eigvalsh(seen.T @ seen / len(seen)), 0.0))
+    spread = np.sqrt(np.maximum(np.linalg.eigvalsh(lidar_rates.T @ lidar_rates / len(lidar_rates)), 0.0))
     if spread[1] < LEAST_TURNING:
         return None  # turns about one axis say nothing of a turn about that axis
-    u, _, vt = np.linalg.svd(seen.T @ felt)
+    u, _, vt = np.linalg.svd(lidar_rates.T @ imu_rates)
     rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
     angle = float(so3.angle(rotation))
-    left, before = float(np.sum((seen - felt @ rotation.T) ** 2)), float(np.sum((seen - felt) ** 2))
-    if angle < _LEAST_ANGLE or left > 0.5 * before or left > 0.36 * float(np.sum(seen**2)):
+    rest, before = (
+        float(np.sum((lidar_rates - imu_rates @ rotation.T) ** 2)),
+        float(np.sum((lidar_rates - imu_rates) ** 2)),
+    )
+    if angle < _LEAST_ANGLE or rest > 0.5 * before or rest > 0.36 * float(np.sum(lidar_rates**2)):
         return None
     R = R_lidar_imu @ rotation
     what = f"IMU: T_lidar_imu is about {np.rad2deg(angle):.0f} deg off by the turns of the scans"
     return Finding("imu-rotation", what, f"correct its rotation to about {_rows(R)}"), R
 
 
-def _by_axis(seen: Floats, felt: Floats) -> list[float | None] | None:
+def _by_axis(lidar_rates: Floats, imu_rates: Floats) -> list[float | None] | None:
     """Correlation about x, y, z of the IMU; None about an axis with hardly any rotation."""
-    if not len(seen):
+    if not len(lidar_rates):
         return None
-    pairs = zip(seen.T, felt.T, strict=True)
+    pairs = zip(lidar_rates.T, imu_rates.T, strict=True)
     return [
         float(a @ b / max(np.sqrt((a @ a) * (b @ b)), 1e-12)) if np.sqrt(np.mean(a**2)) > LEAST_TURNING else None
         for a, b in pairs

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.errors import InputError, LslamError
+from lslam.core.printable import count_of
 from lslam.core.types.arrays import Longs
 from lslam.core.types.scan import FARTHEST_M, NO_RING, Scan, Span
 from lslam.core.types.sequence import Sequence
@@ -22,12 +23,11 @@ from lslam.io.readers import bag as bag_reader
 from lslam.io.readers import find_folder
 from lslam.odometry.frontend.point_times import with_point_times
 from lslam.odometry.integrity.pair_registration import EMPTIED_SHARE, empty_share, filled_directions
-from lslam.pipeline.doctor import Facts, Finding, plural
+from lslam.pipeline.doctor import Facts, Finding, Findings
 from lslam.pipeline.doctor.examine_cameras import examine_cameras
 from lslam.pipeline.doctor.examine_imu import examine_imu
-from lslam.pipeline.doctor.examine_positions import examine_gaps, examine_gnss, examine_jumps
+from lslam.pipeline.doctor.examine_positions import examine_gaps, examine_gnss, examine_jumps, examine_units
 from lslam.pipeline.doctor.examine_turns import examine_turns
-from lslam.pipeline.doctor.examine_units import examine_units
 from lslam.registration.preprocessing.rings import RingRule
 from lslam.registration.preprocessing.views import with_rings
 
@@ -109,38 +109,40 @@ def inspect(sequence: Sequence, samples: int | None = 50, is_quick: bool = False
     no clock of points without times is sought. With `with_cameras` cameras are checked against the scans, which are registered
     for it; raises InputError where there is none.
     """
-    findings = [Finding("recording", sentence) for sentence in sequence.problems]
+    findings = Findings(Finding("recording", sentence) for sentence in sequence.problems)
     n = len(sequence)
-    wanted = n if samples is None else min(n, samples)
-    indices = np.unique(np.linspace(0, n - 1, wanted).round().astype(int)) if n else np.zeros(0, int)
+    count = n if samples is None else min(n, samples)
+    indices = np.unique(np.linspace(0, n - 1, count).round().astype(int)) if n else np.zeros(0, int)
     time = examine_stamps(sequence, findings)
-    clocked = with_point_times(sequence, PreprocessConfig(), is_stated_only=is_quick)
-    notes = list(clocked.notes)
-    points = examine_points(clocked, indices, findings)
-    examine_times(clocked, points, findings)
+    recording = with_point_times(sequence, PreprocessConfig(), is_stated_only=is_quick)
+    notes = list(recording.notes)
+    points = examine_points(recording, indices, findings)
+    examine_times(recording, points, findings)
     rule, sentence = rings_rule(sequence)
     if sentence:
         notes.append(sentence)
     limits = points["per_point_times"]
-    choice = getattr(clocked, "clock_choice", None)
-    if is_quick and limits is None and choice is None and not clocked.motion_compensated:
+    choice = getattr(recording, "clock_choice", None)
+    if is_quick and limits is None and choice is None and not recording.motion_compensated:
         notes.append(
             "point times: no field has them; whether the order of the points tells them is not looked into, because that "
             "takes registrations"
         )
-    units = examine_units(sequence, sequence.ground_truth, sweep=None if limits is None else Span(*limits))
+    units = Findings()
+    examine_units(sequence, units, sequence.ground_truth, sweep=None if limits is None else Span(*limits))
     findings += units
     imu = examine_imu(sequence, findings)
     is_clock_wrong = any(f.code in ("scan-unit", "imu-unit") for f in units)
     turns = None if imu is None or is_quick or is_clock_wrong else examine_turns(sequence, findings)
     if turns is not None and not turns["is_judged"]:
         notes.append("IMU: the sensor hardly turns in the first scans, so its clock and axes could not be checked")
-    cameras = examine_cameras(clocked, findings) if with_cameras else None
+    cameras = examine_cameras(recording, findings) if with_cameras else None
     gnss = examine_gnss(sequence, findings)
-    findings += [*examine_gaps(sequence), *examine_jumps(sequence.ground_truth)]
+    examine_gaps(sequence, findings)
+    examine_jumps(sequence.ground_truth, findings)
     bag: Bag | None = getattr(sequence, "bag", None)
     follows = set().union(*(_FOLLOWS.get(f.code, set()) for f in units))
-    findings = [f for f in findings if f.code not in follows]
+    findings = Findings(f for f in findings if f.code not in follows)
     return {
         "schema": SCHEMA,
         "name": sequence.name,
@@ -153,7 +155,7 @@ def inspect(sequence: Sequence, samples: int | None = 50, is_quick: bool = False
         "points": points,
         "point_times": None if choice is None else choice.facts(),
         "rings_rule": rule,
-        "motion_compensated": clocked.motion_compensated,
+        "motion_compensated": recording.motion_compensated,
         "vertical_correction_deg": float(getattr(sequence, "correction_deg", 0.0)),
         "extrinsics": {
             key: None if T is None else np.asarray(T).tolist() for key, T in sequence.calibration.extrinsics.items()
@@ -185,7 +187,7 @@ def _ground_truth(truth: Trajectory | None, stamps_ns: Longs) -> Facts | None:
     }
 
 
-def examine_stamps(sequence: Sequence, findings: list[Finding]) -> Facts:
+def examine_stamps(sequence: Sequence, findings: Findings) -> Facts:
     """Check rate and gaps of the scans. Stamps that go back were replaced, and reported, by the reader."""
     stamps = sequence.stamps_ns
     steps = np.diff(stamps) * 1e-9
@@ -193,12 +195,10 @@ def examine_stamps(sequence: Sequence, findings: list[Finding]) -> Facts:
     gaps = np.flatnonzero(steps > 1.5 * median) if median > 0 else np.zeros(0, int)
     if len(gaps):
         worst = int(gaps[np.argmax(steps[gaps])])
-        findings.append(
-            Finding(
-                "scan-gaps",
-                f"{plural(len(gaps), 'gap')} in the scans, the longest {steps[worst]:.3f} s after scan {worst}",
-                "the motion prior bridges short ones; run the parts apart with --start and --count where it does not",
-            )
+        findings.add(
+            "scan-gaps",
+            f"{count_of(len(gaps), 'gap')} in the scans, the longest {steps[worst]:.3f} s after scan {worst}",
+            "the motion prior bridges short ones; run the parts apart with --start and --count where it does not",
         )
     return {
         "start_ns": int(stamps[0]) if len(stamps) else None,
@@ -210,8 +210,8 @@ def examine_stamps(sequence: Sequence, findings: list[Finding]) -> Facts:
     }
 
 
-def examine_points(sequence: Sequence, indices: NDArray[Any], findings: list[Finding]) -> Facts:
-    """Statistics over the scans `indices`. Unreadable scans are counted, and the first of them named."""
+def examine_points(sequence: Sequence, indices: NDArray[Any], findings: Findings) -> Facts:
+    """Statistics over the scans `indices`. Unreadable scans are count_of, and the first of them named."""
     scans: list[Facts] = []
     unreadable: list[str] = []
     for index in indices:
@@ -222,15 +222,15 @@ def examine_points(sequence: Sequence, indices: NDArray[Any], findings: list[Fin
     findings += [Finding("scan-unreadable", f"scan cannot be read: {sentence}") for sentence in unreadable[:3]]
     if len(unreadable) > 3:
         more = f"{len(unreadable) - 3} more of the {len(indices)} scans looked at cannot be read"
-        findings.append(Finding("scan-unreadable", more))
+        findings.add("scan-unreadable", more)
     empty = sum(1 for s in scans if s["count"] == 0)
     if empty:
         what = f"{empty} of the {len(indices)} scans looked at hold no points"
-        findings.append(Finding("scan-empty", what, "a run skips them and bridges the motion"))
+        findings.add("scan-empty", what, "a run skips them and bridges the motion")
     faulty = [s for s in scans if s["fault"]]
     if faulty:
         what = f"in {len(faulty)} of the {len(indices)} scans looked at not all is right; scan {faulty[0]['index']}"
-        findings.append(Finding("scan-faults", f"{what}: {faulty[0]['fault']}", "a run uses the rest of these scans"))
+        findings.add("scan-faults", f"{what}: {faulty[0]['fault']}", "a run uses the rest of these scans")
     full = [s for s in scans if s["count"]]
     far = [s for s in full if s["far"]]
     if far:
@@ -238,7 +238,7 @@ def examine_points(sequence: Sequence, indices: NDArray[Any], findings: list[Fin
             f"{sum(s['far'] for s in far)} points of {len(far)} of the {len(indices)} scans looked at lie beyond "
             f"{FARTHEST_M / 1e3:g} km, where no LiDAR sees"
         )
-        findings.append(Finding("points-far", what, "a run leaves them out; check the type and unit of x, y, z"))
+        findings.add("points-far", what, "a run leaves them out; check the type and unit of x, y, z")
     _examine_frame([s["directions"] for s in full if s["valid"]], findings)
     total = sum(s["count"] for s in full)
     measured = [s for s in full if s["valid"]]
@@ -246,7 +246,7 @@ def examine_points(sequence: Sequence, indices: NDArray[Any], findings: list[Fin
         "scans_read": len(scans),
         "scans_unreadable": len(unreadable),
         "scans_empty": empty,
-        "count": _spread([s["count"] for s in scans]),
+        "count": _range([s["count"] for s in scans]),
         "range_m": _ranges(measured),
         "share_nan": sum(s["nan"] for s in full) / total if total else 0.0,
         "share_zero": sum(s["zero"] for s in full) / total if total else 0.0,
@@ -257,43 +257,37 @@ def examine_points(sequence: Sequence, indices: NDArray[Any], findings: list[Fin
     }
 
 
-def _examine_frame(directions: list[Longs], findings: list[Finding]) -> None:
+def _examine_frame(directions: list[Longs], findings: Findings) -> None:
     """Check that scans are in their sensor's frame: then the ground is always at one height below (or above) the origin."""
     shares = [empty_share(directions[0], later) for later in directions[1:]]
     if len(shares) > 1 and np.median(shares) > EMPTIED_SHARE:
-        findings.append(
-            Finding(
-                "points-frame",
-                f"{100 * np.median(shares):.0f} % of the directions that hold points in the first scan hold none in others",
-                "the clouds seem to be in the frame of a world, where a run finds no motion: give them in the sensor's",
-            )
+        findings.add(
+            "points-frame",
+            f"{100 * np.median(shares):.0f} % of the directions that hold points in the first scan hold none in others",
+            "the clouds seem to be in the frame of a world, where a run finds no motion: give them in the sensor's",
         )
 
 
-def examine_times(sequence: Sequence, points: Facts, findings: list[Finding]) -> None:
+def examine_times(sequence: Sequence, points: Facts, findings: Findings) -> None:
     """Check whether scans can be deskewed, and whether per-point times fill a sweep."""
     limits = points["per_point_times"]
     if limits is None:
         if sequence.motion_compensated is not True:
-            findings.append(
-                Finding(
-                    "no-point-times",
-                    "no per-point times and not known to be motion compensated",
-                    "scans cannot be deskewed (state motion_compensated, or per_point, in sequence.toml)",
-                )
+            findings.add(
+                "no-point-times",
+                "no per-point times and not known to be motion compensated",
+                "scans cannot be deskewed (state motion_compensated, or per_point, in sequence.toml)",
             )
         return
     sweeps = (limits[1] - limits[0]) * sequence.rate_hz
     is_about_stamp = limits[0] * sequence.rate_hz < _BESIDE and limits[1] * sequence.rate_hz > -_BESIDE
     if not is_about_stamp or not _SWEEP[0] <= sweeps <= _SWEEP[1]:
-        findings.append(
-            Finding(
-                "point-times",
-                f"per-point times run from {limits[0]:.6g} to {limits[1]:.6g} s, {sweeps:.2g} sweeps at "
-                f"{sequence.rate_hz:g} Hz",
-                "they should be s from the scan's stamp and fill one sweep that holds it; state point_time_unit or rate_hz in "
-                "sequence.toml",
-            )
+        findings.add(
+            "point-times",
+            f"per-point times run from {limits[0]:.6g} to {limits[1]:.6g} s, {sweeps:.2g} sweeps at "
+            f"{sequence.rate_hz:g} Hz",
+            "they should be s from the scan's stamp and fill one sweep that holds it; state point_time_unit or rate_hz in "
+            "sequence.toml",
         )
 
 
@@ -328,7 +322,7 @@ def _scan_facts(scan: Scan) -> Facts:
     return facts
 
 
-def _spread(values: list[int]) -> Facts | None:
+def _range(values: list[int]) -> Facts | None:
     return {"min": min(values), "median": float(np.median(values)), "max": max(values)} if values else None
 
 

@@ -162,11 +162,11 @@ class Corrections:
             view = view_pair(store, candidate, T, size, SHOWN)
         return {**pair_data(view), "scans": [self._results[k].index for k in scans], **judgement(candidate)}
 
-    def _before(self, name: str, configured: str) -> Path | None:
+    def _before(self, name: str, other: str) -> Path | None:
         path = self.folder / name
         if path.is_file():
             return path
-        return Path(configured) if configured and Path(configured).is_file() else None
+        return Path(other) if other and Path(other).is_file() else None
 
     def _scan(self, instant: Instant) -> int:
         """The number of the scan nearest to an instant. Raises InputError for one that the run does not have."""

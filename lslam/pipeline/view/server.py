@@ -43,8 +43,8 @@ ALWAYS = {
 class RefusedError(Exception):
     """A request that is not answered as it wishes."""
 
-    def __init__(self, status: HTTPStatus, said: str = "") -> None:
-        super().__init__(said or status.phrase)
+    def __init__(self, status: HTTPStatus, message: str = "") -> None:
+        super().__init__(message or status.phrase)
         self.status = status
 
 
@@ -138,8 +138,8 @@ class _Handler(BaseHTTPRequestHandler):
             status, answer = HTTPStatus.UNPROCESSABLE_ENTITY, _json({"error": str(error)})
         except Exception as error:
             log.debug("view: %s", self.path.replace(self.server.token, "TOKEN"), exc_info=True)
-            said = f"lslam made a mistake ({type(error).__name__}: {error})"
-            status, answer = HTTPStatus.INTERNAL_SERVER_ERROR, _json({"error": said})
+            message = f"lslam made a mistake ({type(error).__name__}: {error})"
+            status, answer = HTTPStatus.INTERNAL_SERVER_ERROR, _json({"error": message})
         self._send(status, answer)
 
     def _send(self, status: HTTPStatus, answer: Answer) -> None:
@@ -169,7 +169,7 @@ class _Handler(BaseHTTPRequestHandler):
         if origin is not None and origin not in [f"http://{name}" for name in self.server.names]:
             raise RefusedError(HTTPStatus.FORBIDDEN, "other pages are not answered")
 
-    def _asked(self) -> tuple[Site, str, str]:
+    def _site_of(self) -> tuple[Site, str, str]:
         """The site, the path below its address, and the query."""
         parts = urlsplit(self.path)
         first, _, path = unquote(parts.path, errors="strict").lstrip("/").partition("/")
@@ -182,7 +182,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _get(self) -> Answer:
         try:
-            site, path, query = self._asked()
+            site, path, query = self._site_of()
             words = {name: values[-1] for name, values in parse_qs(query, max_num_fields=9).items()}
         except ValueError:
             raise RefusedError(HTTPStatus.BAD_REQUEST) from None
@@ -195,7 +195,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _post(self) -> Answer:
         try:
-            site, path, _ = self._asked()
+            site, path, _ = self._site_of()
             size = int(self.headers.get("Content-Length", "-1"))
         except ValueError:
             raise RefusedError(HTTPStatus.BAD_REQUEST) from None

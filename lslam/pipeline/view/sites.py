@@ -1,24 +1,64 @@
-"""`lslam view`: a run on its server, and those that its corrections lead to."""
+"""`lslam view`: a run on its server, and those that its corrections lead to; its page, its map in tiles, `lslam graph`."""
 
 from __future__ import annotations
 
+import contextlib
+import json
+import logging
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
 import threading
+from collections import deque
+from contextvars import copy_context
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
-from lslam.core.errors import UsageError
+from lslam.core.errors import (
+    InputError,
+    InterruptedRunError,
+    LslamError,
+    OutputError,
+    OutputExistsError,
+    UsageError,
+    cause,
+    input_errors,
+)
 from lslam.core.geometry import se3
+from lslam.core.kernels.cache import cache_folder
+from lslam.core.types.arrays import Floats
+from lslam.core.types.cloud import thin_out
 from lslam.core.types.trajectory import Trajectory
-from lslam.pipeline.rebuild import read_run
-from lslam.pipeline.run_folder import require_odometry
+from lslam.core.untrusted import parse_json
+from lslam.io.formats.point_files import MapCloud
+from lslam.maps.georeference import Projection
+from lslam.maps.octree import points_of, write_octree
+from lslam.pipeline.map_files import georeference_of, note_of, read_json
+from lslam.pipeline.map_tiles import INDEX, is_tiles
+from lslam.pipeline.rebuild import map_of, read_run
+from lslam.pipeline.resume import listing_digest
+from lslam.pipeline.run_folder import MANIFEST, require_odometry
 from lslam.pipeline.view.corrections import Corrections
-from lslam.pipeline.view.graph_job import GraphJob
-from lslam.pipeline.view.page import page_of
-from lslam.pipeline.view.server import RunServer, Site
-from lslam.pipeline.view.tiles import MapTiles
+from lslam.pipeline.view.server import Answer, RunServer, Site
 from lslam.reports.page_data import pack
+from lslam.reports.png import usual_range
+from lslam.reports.shell import RUN, policy, script_of
+
+log = logging.getLogger("lslam")
+REPORT, TRAJECTORY = "report.html", "trajectory.tum"
+TALKS = "connect-src 'self'"
+SERVED = '<script type="application/json" id="served">{}</script>\n'  # tells the page's script
+MOST_LINES = 30  # lines of the child that are kept
+PATIENCE_S = 20.0  # for a child that was asked to stop
+# Of the nodes and of their index; raise VERSION when either means something else. Octrees that are kept, the last used ones.
+NODES, TREE, VERSION, MOST_OCTREES = "nodes.bin", "tree.json", 1, 8
+SAMPLE = 400_000  # points whose intensities give the range that is shown
 
 
 class ViewedSites:
@@ -105,3 +145,224 @@ def change_between(old: Trajectory, new: Trajectory) -> dict[str, Any]:
     shared, mine, other = np.intersect1d(old.stamps_ns, new.stamps_ns, return_indices=True)
     moved = np.linalg.norm(positions[other] - old.positions[mine], axis=1) if len(shared) else np.zeros(1)
     return {"positions": pack(positions, "<f4"), "most_m": float(moved.max()), "mean_m": float(moved.mean())}
+
+
+def page_of(folder: Path) -> Answer:
+    """The report of a run.
+
+    A page of another version, or whoever wrote it, is shown by itself: its script reaches nothing here.
+    Raises InputError when it cannot be read.
+    """
+    with input_errors(folder / REPORT):
+        text = (folder / REPORT).read_text(encoding="utf-8")
+    if not is_ours(text):
+        return _page(text, "sandbox allow-scripts allow-downloads")
+    own = policy(script_of(RUN))
+    text = text.replace(own, f"{own}; {TALKS}", 1)
+    text = text.replace("<main>", SERVED + "<main>", 1)
+    return _page(text, f"{own}; {TALKS}")
+
+
+def is_ours(text: str) -> bool:
+    """Whether a page has the script of this version."""
+    return policy(script_of(RUN)) in text
+
+
+def require_one_run(folder: Path) -> None:
+    """Raise InputError for the folder of a merge, or of a run that ended without a pose: there is nothing to correct."""
+    if read_json(folder / MANIFEST).get("kind") == "merge":
+        raise InputError(
+            f"{folder} is a merge of several runs: open {folder / REPORT} in a browser, or name one of its runs"
+        )
+    if not (folder / TRAJECTORY).is_file():
+        raise InputError(
+            f"{folder} has no {TRAJECTORY}: the run ended before it had a pose, so there is nothing to show"
+        )
+
+
+def require_page(folder: Path) -> None:
+    """Raise InputError where a run has no report; say so where it is of another version."""
+    if not (folder / REPORT).is_file():
+        raise InputError(f"{folder} has no {REPORT}: make one with lslam graph {folder}")
+    with input_errors(folder / REPORT):
+        text = (folder / REPORT).read_text(encoding="utf-8", errors="replace")
+    if not is_ours(text):
+        log.warning(
+            "%s is of another version of lslam: it is shown without tiles and corrections; lslam graph %s makes a new one",
+            folder / REPORT,
+            folder,
+        )
+
+
+def _page(text: str, rules: str) -> Answer:
+    return Answer("text/html; charset=utf-8", text.encode(), headers=(("Content-Security-Policy", rules),))
+
+
+class GraphJob:
+    """The child. `words` are those of `lslam graph` after the run; `out` is its new folder."""
+
+    def __init__(self, run: Path, words: list[str]) -> None:
+        self.out = next_folder(run)
+        command = [sys.executable, "-m", "lslam", "graph", str(run), *words, "--out", str(self.out)]
+        self._is_asked = False
+        self._said: deque[str] = deque(maxlen=MOST_LINES)
+        try:
+            self._child = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.PIPE,
+                text=True,
+                errors="replace",
+                start_new_session=True,  # what the terminal sends comes from the server alone
+            )
+        except OSError as error:
+            raise OutputError(f"lslam graph cannot be started: {cause(error)}") from None
+        self._reader = threading.Thread(target=copy_context().run, args=(self._read,), name="lslam-graph", daemon=True)
+        self._reader.start()
+
+    @property
+    def is_running(self) -> bool:
+        """Whether it is not over."""
+        return self._child.poll() is None
+
+    def state(self) -> dict[str, Any]:
+        """`running`, `done`, `stopped` or `failed`, and what it said."""
+        code = self._child.poll()
+        if code is not None:
+            self._reader.join(PATIENCE_S)
+        # Asked before it heeds signals, it dies of one.
+        word = "running" if code is None else "done" if code == 0 else "stopped" if self._is_asked else "failed"
+        return {"state": word, "out": self.out.name, "said": list(self._said)}
+
+    def stop(self) -> None:
+        """Ask it to stop as Ctrl-C does, and end it where it does not."""
+        if self.is_running:
+            self._is_asked = True
+            self._child.terminate()
+            try:
+                self._child.wait(PATIENCE_S)
+            except subprocess.TimeoutExpired:
+                self._child.kill()
+                self._child.wait()
+
+    def _read(self) -> None:
+        assert self._child.stderr is not None
+        with contextlib.suppress(ValueError):
+            for line in self._child.stderr:
+                self._said.append(line.rstrip().removeprefix("INFO: "))
+
+
+def next_folder(run: Path) -> Path:
+    """RUN-graph beside the run, or the first of RUN-graph-2, ... that is free. Raises OutputExistsError when none is."""
+    named = run.resolve()
+    for number in range(1, 1000):
+        folder = named.with_name(f"{named.name}-graph" + (f"-{number}" if number > 1 else ""))
+        if not folder.exists():
+            return folder
+    raise OutputExistsError(f"{named}-graph to {named}-graph-999 exist: remove some of them")
+
+
+class MapTiles:
+    """The octree of a run's map. `start` finds or builds it in a thread, `stop` ends that.
+
+    positions : (N, 3) m, of the trajectory; each point of a tile knows the nearest
+    """
+
+    def __init__(self, run: Path, positions: Floats) -> None:
+        self._run, self._positions = run, positions
+        self._tree: dict[str, Any] = {}
+        self._folder = Path()
+        self._said: dict[str, Any] = {"share": 0.0}
+        self._is_over = threading.Event()
+        self._thread = threading.Thread(target=copy_context().run, args=(self._build,), name="lslam-tiles", daemon=True)
+
+    def start(self) -> None:
+        """Begin."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End the building, and leave nothing of it."""
+        self._is_over.set()
+        if self._thread.is_alive():
+            self._thread.join()
+
+    def tree(self, words: object = None) -> dict[str, Any]:
+        """The index, its nodes with their numbers of points alone; `share` while it is built, `error` where it cannot be."""
+        if not self._tree:
+            return self._said
+        return {**self._tree, "nodes": {name: count for name, (_, count) in self._tree["nodes"].items()}}
+
+    def node(self, name: str) -> bytes | None:
+        """A node as `write_octree` has it, and behind it the number of the nearest pose of each point, uint32."""
+        begin, count = self._tree.get("nodes", {}).get(name, (0, 0))
+        if not count:
+            return None
+        size = 6 + sum(self._tree["columns"].values())
+        with (self._folder / NODES).open("rb") as stream:
+            stream.seek(begin)
+            data = stream.read(count * size)
+        points = points_of(name, data[: 6 * count], self._tree)
+        return data + self._nearest.query(points)[1].astype("<u4").tobytes()
+
+    @cached_property
+    def _nearest(self) -> cKDTree:
+        return cKDTree(np.nan_to_num(self._positions, nan=1e12))
+
+    def _build(self) -> None:
+        try:
+            cloud, digest = _map_of(self._run)
+            base = cache_folder("octrees")
+            if base is None:
+                raise OutputError("tiles need a folder: name one of your own in XDG_CACHE_HOME")
+            folder = base / digest
+            if not (folder / TREE).is_file():
+                self._write(folder, cloud)
+            tree = parse_json((folder / TREE).read_text(encoding="utf-8"))
+            os.utime(folder)
+            _forget(base, folder)
+            self._folder, self._tree = folder, tree
+        except InterruptedRunError:
+            return
+        except (LslamError, OSError, ValueError) as error:
+            log.warning("no tiles: %s", error)
+            self._said = {"error": str(error)}
+
+    def _write(self, folder: Path, cloud: MapCloud) -> None:
+        sample = thin_out(cloud, SAMPLE).intensity
+        shades = usual_range(np.zeros(0) if sample is None else sample.astype(np.float64))
+        with tempfile.TemporaryDirectory(prefix="part-", dir=folder.parent) as place:
+            with (Path(place) / NODES).open("wb") as stream:
+                tree = write_octree(stream, Path(place), cloud, shades, self._on_share)
+            (Path(place) / TREE).write_text(json.dumps(tree), encoding="utf-8")
+            folder.mkdir(exist_ok=True)
+            for name in (NODES, TREE):  # the index last: with it the octree is there
+                os.replace(Path(place) / name, folder / name)
+
+    def _on_share(self, share: float) -> None:
+        if self._is_over.is_set():
+            raise InterruptedRunError("interrupted while tiles were built")
+        self._said = {"share": share}
+
+
+def _map_of(run: Path) -> tuple[MapCloud, str]:
+    """The map of a run, or its tiles, in its world, and a digest of the files. Raises InputError without one."""
+    try:
+        paths = [map_of(run)]
+        note = note_of(paths[0])
+    except InputError:
+        folder = run / "tiles"
+        if not is_tiles(folder):
+            raise
+        note = read_json(folder / INDEX)
+        paths = [folder / Path(str(tile["file"])).name for tile in note["tiles"]]
+    place = georeference_of(note.get("georeference"))
+    cloud = MapCloud(paths) if note.get("crs") is None or place is None else MapCloud(paths, Projection(place).invert)
+    return cloud, f"{VERSION}-{listing_digest(paths[0] if len(paths) == 1 else paths[0].parent)}"
+
+
+def _forget(base: Path, own: Path) -> None:
+    """Remove octrees that have not been used for longest, and what killed processes left."""
+    folders = sorted((path for path in base.iterdir() if path.is_dir()), key=lambda path: -path.stat().st_mtime)
+    for path in [path for path in folders if path != own][MOST_OCTREES - 1 :]:
+        shutil.rmtree(path, ignore_errors=True)

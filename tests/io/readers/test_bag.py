@@ -16,7 +16,6 @@ from lslam.core.types.sequence import Sequence
 from lslam.io.readers import open_sequence
 from lslam.io.readers.bag import BagSequence
 from lslam.io.readers.kitti_raw import with_gnss, with_imu
-from lslam.pipeline.convert import bag_messages
 from lslam.pipeline.convert.bag_writer import BagWriter
 
 T_BASE_LIDAR = se3.exp(np.array([0.5, -0.1, 1.8, 0.01, -0.02, 1.5]))
@@ -75,7 +74,7 @@ def test_a_split_bag_is_one_recording_in_natural_order(tmp_path: Path) -> None:
         one = scan(part)
 
         def fill(writer: BagWriter, one: Scan = one) -> None:
-            writer.write("/points", one.stamp_ns, bag_messages.cloud(writer.store, one, "lidar"))
+            writer.write("/points", one.stamp_ns, writer.messages.cloud(one, "lidar"))
 
         bag(tmp_path / f"drive_{part}.bag", fill)
     (tmp_path / "drive_10.bag").rename(tmp_path / "drive_10.bag.active")
@@ -99,7 +98,7 @@ def test_bags_of_different_days_are_not_taken_for_one_recording(tmp_path: Path) 
         one = scan(first)
 
         def fill(writer: BagWriter, one: Scan = one) -> None:
-            writer.write("/points", one.stamp_ns, bag_messages.cloud(writer.store, one, "lidar"))
+            writer.write("/points", one.stamp_ns, writer.messages.cloud(one, "lidar"))
 
         bag(tmp_path / f"{name}.bag", fill)
     with pytest.raises(UsageError, match=r"tuesday\.bag begins 86400 s after monday\.bag has ended; name one"):
@@ -154,7 +153,7 @@ def test_the_error_about_a_missing_topic_lists_the_topics(tmp_path: Path) -> Non
     def fixes(*topics: str, status: int = 0) -> Fill:
         def fill(writer: BagWriter) -> None:
             for topic in topics:
-                fix = bag_messages.fix(writer.store, START_NS, np.array([49.0, 8.4, 110.0]), 1.0, "gnss")
+                fix = writer.messages.fix(START_NS, np.array([49.0, 8.4, 110.0]), 1.0, "gnss")
                 fix.status.status = status
                 writer.write(topic, START_NS, fix)
 
@@ -221,7 +220,7 @@ def test_fixes_without_a_fix_are_left_out_and_unknown_errors_are_nan(tmp_path: P
     def fill(writer: BagWriter) -> None:
         for k, (sigma, status) in enumerate([(0.3, 0), (np.nan, 0), (0.1, -1), (0.7, 2)]):
             stamp = START_NS + k * STEP_NS
-            fix = bag_messages.fix(writer.store, stamp, np.array([49.0, 8.0 + k, 110.0]), sigma, "antenna")
+            fix = writer.messages.fix(stamp, np.array([49.0, 8.0 + k, 110.0]), sigma, "antenna")
             fix.status.status = status
             writer.write("/fix", stamp, fix)
 
@@ -244,7 +243,7 @@ def test_truth_of_another_body_is_carried_to_the_lidar_and_odometry_is_no_truth(
             for topic, off in (("/odom", 9.0), ("/robot/ground_truth/pose", 0.0)):
                 moved = T.copy()
                 moved[0, 3] += off
-                writer.write(topic, stamp, bag_messages.odometry(writer.store, stamp, moved, "map", "base"))
+                writer.write(topic, stamp, writer.messages.odometry(stamp, moved, "map", "base"))
 
     path = bag(tmp_path / "a.bag", together(clouds(4), transforms({("base", "lidar"): T_BASE_LIDAR}), fill))
     truth = open_sequence(path).ground_truth

@@ -20,8 +20,7 @@ from lslam.core.types.sequence import Sequence
 from lslam.io.readers import open_sequence
 from lslam.io.readers.point_times import TimeRule
 from lslam.odometry.frontend.register_scans import sweep_of
-from lslam.pipeline.convert import bag_messages
-from lslam.pipeline.convert.bag_writer import BagWriter
+from lslam.pipeline.convert.bag_writer import BagMessages, BagWriter
 
 N = 800
 XYZI = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4")]
@@ -292,7 +291,7 @@ def test_livox_custom_messages_in_both_serialisations(tmp_path: Path, ros: int, 
             stamp = START_NS + k * STEP_NS
             cls: Any = store.types[kind]
             message = cls(
-                header=bag_messages.header(store, stamp + 5000, frame), timebase=stamp, point_num=N, lidar_id=1,
+                header=BagMessages(store).header(stamp + 5000, frame), timebase=stamp, point_num=N, lidar_id=1,
                 rsvd=np.zeros(3, np.uint8), points=points,
             )  # fmt: skip
             data = store.serialize_ros1(message, kind) if ros == 1 else store.serialize_cdr(message, kind)

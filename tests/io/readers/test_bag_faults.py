@@ -22,8 +22,7 @@ from lslam.core.types.sequence import Sequence
 from lslam.io.readers import open_sequence
 from lslam.io.readers.bag_topics import put_in_order
 from lslam.io.readers.ground_truth import Voice
-from lslam.pipeline.convert import bag_messages
-from lslam.pipeline.convert.bag_writer import BagWriter
+from lslam.pipeline.convert.bag_writer import BagMessages, BagWriter
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
 
@@ -133,7 +132,7 @@ def test_compressed_ros1_bags(tmp_path: Path, compression: str) -> None:
     with writer:
         connection = writer.add_connection("/points", CLOUD, typestore=store)
         for k in range(12):
-            message = bag_messages.cloud(store, scan(k, 6000), "lidar")
+            message = BagMessages(store).cloud(scan(k, 6000), "lidar")
             writer.write(connection, scan(k).stamp_ns, store.serialize_ros1(message, CLOUD))
     sequence = open_sequence(tmp_path / "a.bag")
     assert len(sequence) == 12
@@ -184,7 +183,7 @@ def messages(store: Any, count: int) -> list[bytes]:
     parts = []
     for k in range(count):
         one = scan(k, 6000)
-        data = bytes(store.serialize_cdr(bag_messages.cloud(store, one, "lidar"), CLOUD))
+        data = bytes(store.serialize_cdr(BagMessages(store).cloud(one, "lidar"), CLOUD))
         parts.append(record(5, struct.pack("<HIQQ", 7, k, one.stamp_ns, one.stamp_ns) + data))
     return parts
 
@@ -262,7 +261,7 @@ def stamped(stamps: list[int]) -> Any:
     def fill(writer: BagWriter) -> None:
         for k, stamp in enumerate(stamps):
             one = scan(k, stamp_ns=stamp)
-            writer.write("/points", START_NS + k * STEP_NS, bag_messages.cloud(writer.store, one, "lidar"))
+            writer.write("/points", START_NS + k * STEP_NS, writer.messages.cloud(one, "lidar"))
 
     return fill
 

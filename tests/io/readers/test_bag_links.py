@@ -14,7 +14,6 @@ from lslam.core.errors import InputError
 from lslam.core.geometry import se3
 from lslam.io.readers import open_sequence
 from lslam.io.readers.bag import BagSequence
-from lslam.pipeline.convert import bag_messages
 from lslam.pipeline.convert.bag_writer import BagWriter
 
 Pose = NDArray[np.float64]
@@ -30,7 +29,7 @@ def told(pairs: dict[tuple[str, str], Callable[[int], Pose]], count: int = 8, to
         for k in range(count):
             stamp = START_NS + k * STEP_NS
             tree = {pair: pose(k) for pair, pose in pairs.items()}
-            writer.write(topic, stamp, bag_messages.transforms(writer.store, stamp, tree))
+            writer.write(topic, stamp, writer.messages.transforms(stamp, tree))
 
     return fill
 
@@ -129,7 +128,7 @@ def test_truth_of_a_body_is_carried_along_tf(tmp_path: Path) -> None:
     def poses(writer: BagWriter) -> None:
         for k in range(4):
             stamp = START_NS + k * STEP_NS
-            message = bag_messages.odometry(writer.store, stamp, driving(k), "world", "base")
+            message = writer.messages.odometry(stamp, driving(k), "world", "base")
             writer.write("/gt", stamp, message)
             writer.write("/other/gt", stamp, message)
 

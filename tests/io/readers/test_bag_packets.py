@@ -18,7 +18,6 @@ from lslam.core.errors import InputError, UsageError
 from lslam.core.types.sequence import Sequence
 from lslam.io.readers import open_sequence
 from lslam.io.readers.bag import BagSequence
-from lslam.pipeline.convert import bag_messages
 from lslam.pipeline.convert.bag_writer import BagWriter
 
 
@@ -76,7 +75,7 @@ def test_ouster_packets_with_their_imu_and_metadata(tmp_path: Path, kind: str, p
 
     def fill(writer: BagWriter) -> None:
         if is_in_bag:
-            words = bag_messages.text(writer.store, json.dumps(spec.metadata()))
+            words = writer.messages.text(json.dumps(spec.metadata()))
             writer.write("/ouster/metadata", START_NS, words)
         ouster_packets(writer, frames, "lidar")
         ouster_packets(writer, inertial, "imu")

@@ -22,8 +22,7 @@ from lslam.io.formats import bag_files
 from lslam.io.formats.bag_chunks import zstd
 from lslam.io.readers import open_sequence
 from lslam.io.readers.bag import BagSequence
-from lslam.pipeline.convert import bag_messages
-from lslam.pipeline.convert.bag_writer import BagWriter
+from lslam.pipeline.convert.bag_writer import BagMessages, BagWriter
 
 PACKERS: dict[str, Callable[[bytes], bytes]] = {
     ".zstd": lambda data: bytes(zstd().compress(data)),
@@ -49,8 +48,8 @@ def some(*indices: int, topic: str = "/points") -> Fill:
     def fill(writer: BagWriter) -> None:
         for k in indices:
             one = scan(k)
-            writer.write(topic, one.stamp_ns, bag_messages.cloud(writer.store, one, "lidar"))
-            sample = bag_messages.imu(writer.store, one.stamp_ns, GRAVITY + k, np.full(3, 0.1 * k), "lidar")
+            writer.write(topic, one.stamp_ns, writer.messages.cloud(one, "lidar"))
+            sample = writer.messages.imu(one.stamp_ns, GRAVITY + k, np.full(3, 0.1 * k), "lidar")
             writer.write("/imu", one.stamp_ns, sample)
 
     return fill
@@ -150,7 +149,7 @@ def test_recordings_of_the_same_time_are_no_parts(tmp_path: Path) -> None:
         def fill(writer: BagWriter, late: int = late) -> None:
             for k in range(6):
                 one = scan(k, stamp_ns=START_NS + k * STEP_NS + late)
-                writer.write("/points", one.stamp_ns, bag_messages.cloud(writer.store, one, "lidar"))
+                writer.write("/points", one.stamp_ns, writer.messages.cloud(one, "lidar"))
 
         bag(tmp_path / name, fill)
     with pytest.raises(UsageError, match=r"right\.bag and left\.bag hold /points of the same 0\.5 s; name one of them"):
@@ -271,18 +270,18 @@ def test_connections_of_one_topic_are_merged_by_the_times_of_recording(tmp_path:
             writer.write(links[k % 2], stamp, store.serialize_ros1(make(stamp), kind))
 
     def cloud(stamp: int) -> Any:
-        return bag_messages.cloud(store, scan((stamp - START_NS) // STEP_NS, 50, stamp_ns=stamp), "lidar")
+        return BagMessages(store).cloud(scan((stamp - START_NS) // STEP_NS, 50, stamp_ns=stamp), "lidar")
 
     def sample(stamp: int) -> Any:
-        return bag_messages.imu(store, stamp, GRAVITY + (stamp - START_NS) * 1e-9, np.zeros(3), "lidar")
+        return BagMessages(store).imu(stamp, GRAVITY + (stamp - START_NS) * 1e-9, np.zeros(3), "lidar")
 
     def fix(stamp: int) -> Any:
-        return bag_messages.fix(store, stamp, np.array([49, 8 + (stamp - START_NS) * 1e-15, 110]), 1.0, "lidar")
+        return BagMessages(store).fix(stamp, np.array([49, 8 + (stamp - START_NS) * 1e-15, 110]), 1.0, "lidar")
 
     def pose(stamp: int) -> Any:
         T = np.eye(4)
         T[0, 3] = (stamp - START_NS) * 1e-9
-        return bag_messages.odometry(store, stamp, T, "world", "lidar")
+        return BagMessages(store).odometry(stamp, T, "world", "lidar")
 
     with Writer(tmp_path / "a.bag") as writer:
         for topic, make in (("/points", cloud), ("/imu", sample), ("/fix", fix), ("/ground_truth", pose)):

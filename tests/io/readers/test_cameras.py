@@ -18,7 +18,7 @@ from lslam.core.types.camera import cameras_of
 from lslam.io.formats.image_files import from_pixels, write_png
 from lslam.io.formats.sequence_toml import CameraInfo, SequenceInfo, read_sequence_toml, write_sequence_toml
 from lslam.io.readers import open_sequence
-from lslam.pipeline.convert import bag_messages
+from lslam.pipeline.convert.bag_writer import BagMessages
 
 T_LIDAR_CAMERA = se3.inverse(T_CAM0_LIDAR)
 INFO = CameraInfo(
@@ -161,7 +161,7 @@ def images(
         types, store = writer.store.types, writer.store
         for k in range(count):
             stamp = START_NS + 30_000_000 + k * STEP_NS
-            head, pixels = bag_messages.header(store, stamp, frame), picture(k)
+            head, pixels = BagMessages(store).header(stamp, frame), picture(k)
             if encoding in ("png", "jpeg"):
                 stream = io.BytesIO()
                 Pillow.fromarray(pixels).save(
@@ -193,7 +193,7 @@ def images(
         model = values.pop("distortion_model", "plumb_bob")
         region = types["sensor_msgs/msg/RegionOfInterest"](x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
         message = types["sensor_msgs/msg/CameraInfo"](
-            header=bag_messages.header(store, START_NS, frame),
+            header=BagMessages(store).header(START_NS, frame),
             height=24,
             width=32,
             distortion_model=model,

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from lslam.io.readers import open_sequence
 from lslam.io.readers.bag_topics import put_in_order
 from lslam.io.readers.ground_truth import Voice
-from lslam.pipeline.convert import bag_messages
-from lslam.pipeline.convert.bag_writer import BagWriter
+from lslam.pipeline.convert.bag_writer import BagMessages, BagWriter
 
 Stamps = NDArray[np.int64]
 SECOND = 10**9
@@ -148,14 +147,12 @@ def on_a_clock(shift_ns: Callable[[int], int]) -> Fill:
 
     def fill(writer: BagWriter) -> None:
         for k in range(COUNT):
-            message = bag_messages.cloud(
-                writer.store, scan(k, 50, stamp_ns=int(TRUE[k]) + shift_ns(int(TRUE[k]))), "lidar"
-            )
+            message = writer.messages.cloud(scan(k, 50, stamp_ns=int(TRUE[k]) + shift_ns(int(TRUE[k]))), "lidar")
             writer.write("/points", int(TRUE[k]) + 15_000_000, message)
         for k in range(COUNT * 10):
             stamp = START_NS + k * 10_000_000
             values = GRAVITY, np.array([0, 0, 0.001 * k])
-            message = bag_messages.imu(writer.store, stamp + shift_ns(stamp), *values, "imu")
+            message = writer.messages.imu(stamp + shift_ns(stamp), *values, "imu")
             writer.write("/imu", stamp + 2_000_000, message)
 
     return fill
@@ -185,11 +182,11 @@ def on_clocks(epochs_ns: dict[str, int]) -> Fill:
             at = {topic: int(TRUE[k]) + epochs_ns[topic] for topic in STREAMS}
             place = np.array([48.0, 11.0 + 1e-6 * k, 500.0])
             for topic, message in {
-                "/points": bag_messages.cloud(store, scan(k, 50, stamp_ns=at["/points"]), "lidar"),
-                "/rear": bag_messages.cloud(store, scan(100 + k, 50, stamp_ns=at["/rear"]), "rear"),
-                "/imu": bag_messages.imu(store, at["/imu"], GRAVITY, np.full(3, 0.01 * k), "imu"),
-                "/fix": bag_messages.fix(store, at["/fix"], place, 1.0, "gnss"),
-                "/ground_truth": bag_messages.odometry(store, at["/ground_truth"], np.eye(4), "map", "lidar"),
+                "/points": BagMessages(store).cloud(scan(k, 50, stamp_ns=at["/points"]), "lidar"),
+                "/rear": BagMessages(store).cloud(scan(100 + k, 50, stamp_ns=at["/rear"]), "rear"),
+                "/imu": BagMessages(store).imu(at["/imu"], GRAVITY, np.full(3, 0.01 * k), "imu"),
+                "/fix": BagMessages(store).fix(at["/fix"], place, 1.0, "gnss"),
+                "/ground_truth": BagMessages(store).odometry(at["/ground_truth"], np.eye(4), "map", "lidar"),
             }.items():
                 writer.write(topic, int(TRUE[k]) + 15_000_000, message)
 
@@ -246,7 +243,7 @@ def test_fixes_without_a_fix_do_not_cost_the_clock_of_the_others(tmp_path: Path)
     def fill(writer: BagWriter) -> None:
         for k in range(COUNT):
             stamp = int(TRUE[k]) - S37 * (k >= 12)
-            message = bag_messages.fix(writer.store, stamp, np.array([48.0, 11.0 + 1e-6 * k, 500.0]), 1.0, "gnss")
+            message = writer.messages.fix(stamp, np.array([48.0, 11.0 + 1e-6 * k, 500.0]), 1.0, "gnss")
             if k % 7 == 3:
                 message.status.status = -1
             writer.write("/fix", int(TRUE[k]) + 5_000_000, message)
@@ -261,8 +258,8 @@ def test_a_recording_that_was_played_in_a_loop_is_read_once(tmp_path: Path) -> N
     def fill(writer: BagWriter) -> None:
         for k in range(2 * COUNT):
             one = scan(k % COUNT, 50)
-            writer.write("/points", START_NS + k * STEP_NS, bag_messages.cloud(writer.store, one, "lidar"))
-            message = bag_messages.imu(writer.store, one.stamp_ns, GRAVITY, np.full(3, 0.01 * (k % COUNT)), "imu")
+            writer.write("/points", START_NS + k * STEP_NS, writer.messages.cloud(one, "lidar"))
+            message = writer.messages.imu(one.stamp_ns, GRAVITY, np.full(3, 0.01 * (k % COUNT)), "imu")
             writer.write("/imu", START_NS + k * STEP_NS, message)
 
     sequence = open_sequence(bag(tmp_path / "a.mcap", fill, "mcap"))

@@ -19,7 +19,6 @@ from lslam.core.config import load_config
 from lslam.core.types.scan import Scan
 from lslam.core.types.sequence import Sequence
 from lslam.io.readers import open_sequence
-from lslam.pipeline.convert import bag_messages
 from lslam.pipeline.convert.bag_writer import BagWriter
 from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import simulate
@@ -103,10 +102,10 @@ def write(path: Path, driver: Callable[[Scan], tuple[int, NDArray[Any]]], kind: 
     assert T_lidar_imu is not None
 
     def fill(writer: BagWriter) -> None:
-        tree = bag_messages.transforms(writer.store, START_NS, {("lidar", "imu"): T_lidar_imu})
+        tree = writer.messages.transforms(START_NS, {("lidar", "imu"): T_lidar_imu})
         writer.write("/tf_static", START_NS, tree)
         for stamp, accel, gyro in zip((START_NS + imu.stamps_ns).tolist(), imu.accel, imu.gyro, strict=True):
-            writer.write("/imu", stamp, bag_messages.imu(writer.store, stamp, accel, gyro, "imu"))
+            writer.write("/imu", stamp, writer.messages.imu(stamp, accel, gyro, "imu"))
         for scan in scans:
             stamp, rows = driver(scan)
             writer.write("/points", stamp, raw_cloud(writer.store, stamp, rows))

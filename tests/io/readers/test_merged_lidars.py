@@ -24,8 +24,7 @@ from lslam.core.types.sequence import Sequence, StatedTimes, select
 from lslam.io.formats.kitti_layout import write_scan, write_times
 from lslam.io.readers import open_sequence
 from lslam.odometry.frontend.point_times import with_point_times
-from lslam.pipeline.convert import bag_messages
-from lslam.pipeline.convert.bag_writer import BagWriter
+from lslam.pipeline.convert.bag_writer import BagMessages, BagWriter
 from lslam.pipeline.resume import input_digest
 from lslam.registration.preprocessing.views import RINGS_APART, FurtherLidar, MergedLidars, with_rings
 
@@ -51,7 +50,7 @@ def sweeps(
 def of(topic: str, frame: str, scans: Listed[Scan]) -> Fill:
     def fill(writer: BagWriter) -> None:
         for one in scans:
-            writer.write(topic, one.stamp_ns, bag_messages.cloud(writer.store, one, frame))
+            writer.write(topic, one.stamp_ns, writer.messages.cloud(one, frame))
 
     return fill
 
@@ -229,7 +228,7 @@ def test_livox_lidars_of_one_topic_are_told_apart_by_their_id(tmp_path: Path) ->
                 for i, (x, y, z) in enumerate(one.points)
             ]
             message = cls(
-                header=bag_messages.header(store, stamp, "livox_frame"), timebase=stamp, point_num=400, lidar_id=3 + k % 2,
+                header=BagMessages(store).header(stamp, "livox_frame"), timebase=stamp, point_num=400, lidar_id=3 + k % 2,
                 rsvd=np.zeros(3, np.uint8), points=points,
             )  # fmt: skip
             writer.write(connection, stamp, store.serialize_ros1(message, kind))

@@ -19,7 +19,6 @@ from lslam.core.types.sequence import Sequence
 from lslam.io.formats.bag_chunks import BLOCK, RangedFile
 from lslam.io.readers import open_sequence
 from lslam.io.remote import RemotePath
-from lslam.pipeline.convert import bag_messages
 from lslam.pipeline.convert.bag_writer import BagWriter
 from lslam.pipeline.resume import input_digest, listing_digest
 from lslam.pipeline.run import run
@@ -42,7 +41,7 @@ def images(count: int, first: int) -> Fill:
         for k in range(first, first + count):
             stamp = START_NS + k * STEP_NS // 3
             data = rng.integers(0, 256, IMAGE, np.uint8)
-            header = bag_messages.header(writer.store, stamp, "camera")
+            header = writer.messages.header(stamp, "camera")
             writer.write("/camera", stamp, kind(header=header, format="jpeg", data=data))
 
     return fill
@@ -51,7 +50,7 @@ def images(count: int, first: int) -> Fill:
 def cloud(index: int) -> Fill:
     def fill(writer: BagWriter) -> None:
         one = scan(index, 2000)
-        writer.write("/points", one.stamp_ns, bag_messages.cloud(writer.store, one, "lidar"))
+        writer.write("/points", one.stamp_ns, writer.messages.cloud(one, "lidar"))
 
     return fill
 

@@ -15,8 +15,7 @@ from lslam.core.types.imu import WheelStream
 from lslam.io.formats.stamped_csv import read_wheels_csv, write_wheels_csv
 from lslam.io.readers import open_sequence
 from lslam.io.readers.wheels import read_wheels
-from lslam.pipeline.convert import bag_messages
-from lslam.pipeline.convert.bag_writer import BagWriter
+from lslam.pipeline.convert.bag_writer import BagMessages, BagWriter
 
 T_BASE_LIDAR = se3.make(so3.exp(np.array([0.0, 0.0, 0.3])), np.array([0.8, 0.1, 1.7]))
 SPEED, YAW_RATE, COUNT = 3.0, 0.4, 60
@@ -36,7 +35,7 @@ def odometry(speed: float, yaw_rate: float) -> Fill:
         store = writer.store
         for k in range(COUNT):
             pose = se3.exp(0.02 * k * np.array([SPEED, 0.0, 0.0, 0.0, 0.0, YAW_RATE]))
-            message = bag_messages.odometry(store, START_NS + 20_000_000 * k, pose, "odom", "base")
+            message = BagMessages(store).odometry(START_NS + 20_000_000 * k, pose, "odom", "base")
             kind = store.types["geometry_msgs/msg/TwistWithCovariance"]
             message.twist = kind(twist=twist_of(store, speed, yaw_rate), covariance=np.zeros(36))
             writer.write("/odom", START_NS + 20_000_000 * k, message)
@@ -48,7 +47,7 @@ def twists(writer: BagWriter) -> None:
     kind = writer.store.types["geometry_msgs/msg/TwistStamped"]
     for k in range(COUNT):
         stamp = START_NS + 20_000_000 * k
-        header = bag_messages.header(writer.store, stamp, "base")
+        header = writer.messages.header(stamp, "base")
         writer.write("/odom", stamp, kind(header=header, twist=twist_of(writer.store, SPEED, YAW_RATE)))
 
 

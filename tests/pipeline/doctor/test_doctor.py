@@ -21,7 +21,7 @@ from lslam.core.types.scan import Scan
 from lslam.core.types.sequence import Calibration, Sequence, no_shared_time
 from lslam.io.readers import open_sequence
 from lslam.odometry.inertial.imu_cleaning import ImuFault, ImuRefusedError, clean
-from lslam.pipeline.doctor import Facts, Finding
+from lslam.pipeline.doctor import Facts, Finding, Findings
 from lslam.pipeline.doctor.examine_imu import examine_imu
 from lslam.pipeline.doctor.examine_positions import examine_gnss
 from lslam.pipeline.doctor.examine_turns import compare, examine_turns
@@ -57,7 +57,7 @@ def against_truth(
     assert truth is not None
     assert known is not None
     stamps = truth.stamps_ns[:60]
-    findings: list[Finding] = []
+    findings = Findings()
     cleaned = clean(imu, int(stamps[0]), int(stamps[-1]))
     facts = compare(cleaned, known if T is None else T, stamps, truth.poses[:60], findings)
     return findings, facts
@@ -100,7 +100,7 @@ def test_degrees_per_second(healthy: Sequence) -> None:
     findings, _ = against_truth(healthy, degrees)
     assert codes(findings) == ["imu-gyro-unit"]
     assert "57 times" in findings[0].what
-    alone: list[Finding] = []
+    alone = Findings()
     examine_imu(spoilt(healthy, imu=degrees), alone)
     assert codes(alone) == ["imu-gyro-unit"]
 
@@ -177,7 +177,7 @@ def back(imu: ImuStream) -> ImuStream:
     ],
 )  # fmt: skip
 def test_faults_of_the_imu_itself(healthy: Sequence, spoil: Spoil, code: str, said: str) -> None:
-    findings: list[Finding] = []
+    findings = Findings()
     examine_imu(spoilt(healthy, imu=spoil(imu_of(healthy))), findings)
     assert codes(findings) == [code]
     assert said in str(findings[0])
@@ -186,7 +186,7 @@ def test_faults_of_the_imu_itself(healthy: Sequence, spoil: Spoil, code: str, sa
 
 def test_an_imu_that_measures_nothing(healthy: Sequence) -> None:
     imu = imu_of(healthy)
-    findings: list[Finding] = []
+    findings = Findings()
     assert examine_turns(spoilt(healthy, imu=replace(imu, gyro=0 * imu.gyro)), findings) is None
     assert codes(findings) == ["imu-refused"]
     assert "repeats one reading" in findings[0].what
@@ -194,14 +194,14 @@ def test_an_imu_that_measures_nothing(healthy: Sequence) -> None:
 
 
 def test_missing_extrinsics(healthy: Sequence) -> None:
-    findings: list[Finding] = []
+    findings = Findings()
     examine_imu(spoilt(healthy, calibration=Calibration()), findings)
     assert codes(findings) == ["imu-extrinsics"]
     assert "--extrinsics" in findings[0].way_out
 
 
 def test_gaps_of_the_scans_and_times_in_the_wrong_unit(healthy: Sequence) -> None:
-    findings: list[Finding] = []
+    findings = Findings()
     stamps = np.delete(healthy.stamps_ns, [20, 21, 50])
     examine_stamps(spoilt(healthy, stamps_ns=stamps), findings)
     assert codes(findings) == ["scan-gaps"]
@@ -220,7 +220,7 @@ LIMITS = [
 
 @pytest.mark.parametrize(("limits", "is_sound"), LIMITS)
 def test_point_times_fill_a_sweep_that_holds_the_stamp(healthy: Sequence, limits: list[float], is_sound: bool) -> None:
-    findings: list[Finding] = []
+    findings = Findings()
     examine_times(healthy, {"per_point_times": limits}, findings)
     assert codes(findings) == ([] if is_sound else ["point-times"])
     assert is_sound or "from the scan's stamp" in findings[0].way_out
@@ -256,7 +256,7 @@ def test_clouds_in_the_frame_of_a_world(healthy: Sequence) -> None:
         return replace(scan, points=(scan.points @ poses[i, :3, :3].T + poses[i, :3, 3]).astype(np.float32))
 
     for scan, expected in ((read, []), (moved, ["points-frame"])):
-        findings: list[Finding] = []
+        findings = Findings()
         examine_points(spoilt(healthy, scan=scan), np.arange(0, 80, 8), findings)
         assert codes(findings) == expected
 
@@ -266,7 +266,7 @@ def test_satellite_fixes(healthy: Sequence) -> None:
     assert gnss is not None
 
     def examined(spoilt_gnss: GnssStream) -> tuple[list[Finding], Facts | None]:
-        findings: list[Finding] = []
+        findings = Findings()
         return findings, examine_gnss(spoilt(healthy, gnss=spoilt_gnss), findings)
 
     findings, facts = examined(gnss)

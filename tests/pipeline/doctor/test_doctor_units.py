@@ -14,8 +14,8 @@ from lslam.core.types.scan import Span
 from lslam.core.types.sequence import Sequence
 from lslam.core.types.trajectory import Trajectory
 from lslam.io.readers import open_sequence
-from lslam.pipeline.doctor import Finding
-from lslam.pipeline.doctor.examine_units import examine_units
+from lslam.pipeline.doctor import Finding, Findings
+from lslam.pipeline.doctor.examine_positions import examine_units
 from lslam.pipeline.doctor.inspect import inspect
 
 SAMPLE = Path(__file__).parents[3] / "sample_data"
@@ -40,14 +40,20 @@ def truth_of(sequence: Sequence, every_ns: int = 50_000_000, count: int = 180) -
     return Trajectory(stamps, np.tile(np.eye(4), (count, 1, 1)))
 
 
+def units(sequence: Sequence, *arguments: object, **options: object) -> Findings:
+    findings = Findings()
+    examine_units(sequence, findings, *arguments, **options)  # type: ignore[arg-type]
+    return findings
+
+
 def only(findings: list[Finding]) -> Finding:
     [found] = findings
     return found
 
 
 def test_nothing_is_wrong_with_the_sample(healthy: Sequence) -> None:
-    assert examine_units(healthy, healthy.ground_truth, sweep=Span(0.0, 0.1)) == []
-    assert examine_units(healthy, truth_of(healthy)) == []
+    assert units(healthy, healthy.ground_truth, sweep=Span(0.0, 0.1)) == []
+    assert units(healthy, truth_of(healthy)) == []
 
 
 @pytest.mark.parametrize(("factor", "said"), TIMES[:2] + TIMES[3:])
@@ -56,7 +62,7 @@ def test_nothing_is_wrong_with_the_sample(healthy: Sequence) -> None:
 def test_scans(healthy: Sequence, factor: float, said: str, is_stated: bool, hz: float) -> None:
     stamps = np.round(np.arange(50) * 1e9 / hz * factor).astype(np.int64)
     other = spoilt(healthy, stamps_ns=stamps, rate_hz=hz if is_stated else hz / factor, imu=None, gnss=None)
-    found = only(examine_units(other))
+    found = only(units(other))
     assert (found.code, said in found.what) == ("scan-unit", True)
     assert f"makes {hz:g} Hz of it" in found.way_out
 
@@ -67,7 +73,7 @@ def test_scans_that_are_few_or_many_are_no_unit(healthy: Sequence, step_s: float
     """Every tenth scan of a recording, a fast sensor, one that is told to wait: also where another rate is stated."""
     stamps = np.round(np.arange(100) * step_s * 1e9).astype(np.int64)
     other = spoilt(healthy, stamps_ns=stamps, rate_hz=rate_hz or 1 / step_s, imu=None, gnss=None)
-    assert examine_units(other) == []
+    assert units(other) == []
 
 
 @pytest.mark.parametrize(("factor", "said"), TIMES)
@@ -78,34 +84,34 @@ def test_streams(healthy: Sequence, name: str, factor: float, said: str) -> None
     stamps = np.round(stream.stamps_ns * min(factor, 1e8)).astype(np.int64) + 10**9
     other = spoilt(healthy, **{name: replace(stream, stamps_ns=stamps)})
     if factor > 1e8:
-        assert examine_units(other) == [], "no unit is 1e8 times another"
+        assert units(other) == [], "no unit is 1e8 times another"
         return
-    found = only(examine_units(other))
+    found = only(units(other))
     assert (found.code, said in found.what) == (f"{name}-unit", True)
-    assert examine_units(other, with_imu=name != "imu", with_gnss=name != "gnss") == []
+    assert units(other, with_imu=name != "imu", with_gnss=name != "gnss") == []
 
 
 @pytest.mark.parametrize("factor", [1e3, 1e-3])
 def test_truth(healthy: Sequence, factor: float) -> None:
     truth = truth_of(healthy)
     wrong = replace(truth, stamps_ns=np.round(truth.stamps_ns * factor).astype(np.int64))
-    assert only(examine_units(healthy, wrong)).code == "truth-unit"
-    assert examine_units(healthy, replace(wrong, has_stamps=False)) == []
+    assert only(units(healthy, wrong)).code == "truth-unit"
+    assert units(healthy, replace(wrong, has_stamps=False)) == []
     # Of an hour, from which a few scans were cut, at the rate of a survey's.
-    assert examine_units(healthy, truth_of(healthy, 5_000_000, 720_000)) == []
+    assert units(healthy, truth_of(healthy, 5_000_000, 720_000)) == []
 
 
 def test_truth_at_the_scans_own_stamps_is_no_second_finding(healthy: Sequence) -> None:
     assert healthy.ground_truth is not None
     slow = spoilt(healthy, stamps_ns=healthy.stamps_ns * 1000)
     truth = replace(healthy.ground_truth, stamps_ns=slow.stamps_ns)
-    assert [f.code for f in examine_units(slow, truth)] == ["scan-unit"]
+    assert [f.code for f in units(slow, truth)] == ["scan-unit"]
 
 
 @pytest.mark.parametrize(("end_s", "is_unit"), [(100.0, True), (1e5, True), (1e-4, True), (0.1, False), (0.01, False)])
 def test_point_times(healthy: Sequence, end_s: float, is_unit: bool) -> None:
     """A tenth of a sweep is what drivers send that cut it to pieces."""
-    assert [f.code for f in examine_units(healthy, sweep=Span(0.0, end_s))] == (["point-unit"] if is_unit else [])
+    assert [f.code for f in units(healthy, sweep=Span(0.0, end_s))] == (["point-unit"] if is_unit else [])
 
 
 def test_what_a_wrong_unit_brings_about_is_no_finding_of_its_own(healthy: Sequence) -> None:

@@ -11,7 +11,7 @@ from lslam.core.geometry import se3, so3
 from lslam.core.geometry.se3 import ContinuousMotion
 from lslam.core.types.camera import Camera, Lens
 from lslam.core.types.scan import Scan
-from lslam.pipeline.doctor import Finding
+from lslam.pipeline.doctor import Findings
 from lslam.pipeline.doctor.examine_cameras import Offset, _judge, beam_spacing, depth_edges, offset_of
 from lslam.simulation.camera import CameraModel, SimulatedCamera
 from lslam.simulation.scenarios import SimulatedDrive, simulate
@@ -89,7 +89,7 @@ def test_an_offset_is_found_in_pixels_and_in_time(
 
 def test_offsets_beyond_their_error_and_the_beams_are_findings() -> None:
     def judged(pixels: tuple[float, float], time_s: float, sigma: float = 0.1) -> list[str]:
-        findings: list[Finding] = []
+        findings = Findings()
         offset = Offset(np.array(pixels), time_s, np.full(2, sigma), 0.002, 20, np.array([0.8, 2.2]))
         _judge("front", offset, findings)
         return [f.code for f in findings]
