@@ -175,8 +175,21 @@ def _fail_usage(error: click.ClickException) -> NoReturn:
         click.echo("\nNew here? `lslam demo` simulates a drive, runs it and opens its page, in a minute.", err=True)
         sys.exit(2)
     ctx = getattr(error, "ctx", None)
-    command = "lslam" if ctx is None else ctx.command_path
+    command = _typed_command() if ctx is None else ctx.command_path
     _fail(f"{error.format_message().rstrip('.')}; see {command} --help", 2)
+
+
+def _typed_command() -> str:
+    """Command on the command line, with its sub-command: some errors of click do not say where they are raised."""
+    command: click.Command = cli
+    names = ["lslam"]
+    for word in sys.argv[1:]:
+        inner = command.get_command(click.Context(command), word) if isinstance(command, click.Group) else None
+        if inner is None:
+            break
+        command = inner
+        names.append(word)
+    return " ".join(names)
 
 
 def _report_mistake(error: Exception) -> NoReturn:
