@@ -166,6 +166,13 @@ class Reanchoring:
 def _find_start(sequence: Sequence, prior_map: PriorMap, search: PlaceFinder, config: Config, watch: Watch) -> Start:
     """Find the start of the drive in the map. Raises RunFailedError when there is none, InterruptedRunError on a stop."""
     prior, where = _prior_of(sequence, prior_map, config)
+    if config.localize.start is not None and prior is not None:
+        off_m = float(np.linalg.norm(prior_map.points[:, :2] - prior.position, axis=1).min())
+        if off_m > prior.radius:
+            x, y, _ = config.localize.start
+            raise RunFailedError(
+                f"--start {x:g},{y:g} lies {off_m:.0f} m off the map {prior_map.source}: name a place in it"
+            )
     log.info("searching the drive in the map, %s", where)
     start = search.find(prior, watch.should_stop)
     if watch.should_stop():
@@ -173,8 +180,9 @@ def _find_start(sequence: Sequence, prior_map: PriorMap, search: PlaceFinder, co
     if start is None:
         counts = Counter(reason.split(",")[0] for reason in search.reasons).most_common(MOST_REASONS)
         why = "; ".join(f"{reason} ({count} x)" for reason, count in counts) or "keyframes do not agree"
+        way_out = "Say where it begins with" if config.localize.start is None else "It may begin elsewhere: correct"
         raise RunFailedError(
-            f"the drive was not found in {prior_map.source}, {where}: {why}. Say where it begins with --start X,Y,HEADING"
+            f"the drive was not found in {prior_map.source}, {where}: {why}. {way_out} --start X,Y,HEADING"
         )
     log.info(
         "found in the map by %d of %d keyframes tried, %.0f %% of the upright points fit",

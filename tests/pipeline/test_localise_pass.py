@@ -138,6 +138,11 @@ def test_a_drive_that_the_map_does_not_know_fails_with_the_way_out(map_run: Path
         lslam.run(SAMPLE, wrong, out=tmp_path / "out")
 
 
+def test_a_start_off_the_map_is_said_to_be_off_it(map_run: Path, tmp_path: Path) -> None:
+    with pytest.raises(RunFailedError, match=r"--start 5000,0 lies 4[0-9]{3} m off the map .*: name a place in it"):
+        lslam.run(SAMPLE, config(map_run, "localize.start=[5000.0, 0.0, 90.0]"), out=tmp_path / "out")
+
+
 def test_a_keyframe_carried_too_far_is_found_anew(map_run: Path) -> None:
     section = load_config(None, []).registration
     prior_map = read_prior_map(map_run, section)
