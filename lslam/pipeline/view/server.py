@@ -7,7 +7,7 @@ import logging
 import secrets
 import shutil
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -121,6 +121,14 @@ class _Handler(BaseHTTPRequestHandler):
     def do_POST(self) -> None:
         """Have the API do something."""
         self._answer(self._post)
+
+    def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
+        """Answer as JSON what is refused before it comes here: methods that no page uses, and what is no request."""
+        is_method = code == HTTPStatus.NOT_IMPLEMENTED
+        status = HTTPStatus.METHOD_NOT_ALLOWED if is_method else HTTPStatus(code)
+        self.close_connection = True
+        answer = _json({"error": status.phrase if is_method or message is None else message})
+        self._send(status, replace(answer, headers=(("Allow", "GET, HEAD, POST"),) if is_method else ()))
 
     def log_message(self, format: str, *args: Any) -> None:  # noqa: A002
         """The log of lslam alone; addresses have the token in them."""
