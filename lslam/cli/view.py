@@ -7,6 +7,7 @@ import threading
 import webbrowser
 from contextvars import copy_context
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -31,9 +32,23 @@ Examples:
 """
 
 
+class Port(click.IntRange):
+    """Parameter type: number of a port."""
+
+    def __init__(self) -> None:
+        super().__init__(0, 65535)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Number of the value."""
+        try:
+            return super().convert(value, param, ctx)
+        except click.BadParameter:
+            self.fail(f"{value!r} is no port: a whole number up to 65535, 0 for any that is free", param, ctx)
+
+
 @click.command(help=HELP, epilog=EPILOG)
 @click.argument("run", metavar="RUN", type=click.Path(path_type=Path))
-@options.option("--port", "N", "Port of the server  [any that is free].", type=click.IntRange(0, 65535))
+@options.option("--port", "N", "Port of the server  [any that is free].", type=Port())
 @options.flag("--no-browser", "Print the address, and open no browser.")
 @options.path("--rerun", "FILE", "Write a recording for rerun, and end.")
 @options.flag("--overwrite", "Replace a recording that is there.")

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from calling import lslam
 from scipy.spatial import cKDTree
 
 from lslam.cli.main import cli
@@ -43,6 +44,13 @@ def run(tmp_path: Path) -> Path:
     (tmp_path / "manifest.json").write_text(json.dumps(document))
     write_map(tmp_path / "map.laz", ArrayCloud.of(POINTS), MapNote("drive", 0.2), place)
     return tmp_path
+
+
+def test_a_word_for_a_port_is_told_what_a_port_is() -> None:
+    for word in ("abc", "70000"):
+        done = lslam("view", "nowhere", "--port", word)
+        assert done.returncode == 2
+        assert f"'{word}' is no port: a whole number up to 65535" in done.stderr
 
 
 def test_all_is_shown_in_the_world_of_the_run(run: Path) -> None:
