@@ -42,10 +42,11 @@ _MOST_FILES = 6  # named
     "          lslam run 2011_09_26_drive_0005_sync --set map.voxel=0.1 --json"
 )
 @click.argument("sequence", required=False)
-@options.path(
+@options.option(
     "--again",
     "RUN",
     "Make this run again, by its folder alone, and compare the results; SEQUENCE says where its recording is now.",
+    type=options.Place(path_type=Path),
 )
 @options.method
 @options.preset
@@ -240,9 +241,10 @@ def run_again(folder: Path, recording: str | None, given: dict[str, Any]) -> Non
     for name, option in options.typed_options().items():
         if name not in _FREE:
             raise UsageError(f"{option} is not for --again, which takes all of that from the run: leave it out")
+    for option, place in (("--again", folder), ("--out", given["out"])):
+        if isinstance(place, RemotePath):
+            raise UsageError(f"{option} {place}: --again compares folders of this machine, name one")
     out = given["out"] or folder.absolute().with_name(f"{folder.absolute().name}-again")
-    if isinstance(out, RemotePath):
-        raise UsageError(f"--out {out}: --again compares folders of this machine, name one")
     from lslam.core.types.warned import collect_warnings
     from lslam.pipeline.again import (
         compare_results,
