@@ -106,6 +106,7 @@ def test_a_run_without_a_map_delivers_the_rest_and_says_it(tmp_path: Path) -> No
     assert {path.name for path in out.iterdir()} == FILES - {"map.laz", "plan.tif"}
     for words in (text_of(out / "sheet.pdf")[1], flat(out / "README.txt")):
         assert "There is no map, and no plan from above: the run was made without one" in words
+    assert f"`lslam map {run.folder}` builds it" in flat(out / "README.txt")
 
 
 @pytest.mark.parametrize("status", ["diverged", "interrupted", "running"])

@@ -124,7 +124,8 @@ def _write_map(folder: Path, survey: Survey) -> tuple[dict[str, str], list[str]]
     try:
         path = map_of(survey.folder)
     except InputError:
-        return {}, ["There is no map, and no plan from above: the run was made without one; lslam map RUN builds it."]
+        way = f"the run was made without one; `lslam map {survey.folder}` builds it"
+        return {}, [f"There is no map, and no plan from above: {way}, and then deliver again."]
     note = note_of(path)
     attributes = dict(note.get("attributes") or {})
     cloud = open_map(path, attributes)
