@@ -124,6 +124,13 @@ def _errors(figure: Any, run: PlottedRun) -> None:
     turn.plot(distance, absolute.rotation_errors_deg, color=COLOURS[0], lw=0.8)
     label(planar, "", f"error ({absolute.alignment}), m")
     label(turn, "distance, m", "rotation error, deg")
+    labels = [planar.yaxis.label, turn.yaxis.label]
+    figure.draw_without_rendering()
+    above, below = (text.get_window_extent() for text in labels)
+    if below.y1 > above.y0:  # on a narrow figure they are longer than their plots are high
+        share = 0.9 * (above.y0 + above.y1 - below.y0 - below.y1) / (above.height + below.height)
+        for text in labels:
+            text.set_size(share * text.get_size())
 
 
 def _imu(figure: Any, run: PlottedRun) -> None:

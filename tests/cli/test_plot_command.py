@@ -14,6 +14,7 @@ from lslam.core.config import load_config
 from lslam.evaluation.metric import AbsoluteError
 from lslam.pipeline.again import gather_figure
 from lslam.reports.figures import draw_figure
+from lslam.reports.picture import house_style
 
 WALLS = SAMPLE / "sequences" / "00" / "map_perturbed.osm"
 
@@ -72,6 +73,16 @@ def test_errors_are_in_the_axes_of_the_lidar(run: Path) -> None:
         ahead, np.einsum("ni,ni->n", axes, absolute.aligned_positions - plotted.evaluation.gt_positions), atol=1e-9
     )
     np.testing.assert_allclose(np.hypot(both, up), whole, atol=1e-9)
+
+
+@pytest.mark.parametrize("width", [70.0, 88.9])
+def test_labels_of_errors_stay_beside_their_plots(run: Path, width: float) -> None:
+    with house_style(8.0):
+        figure = draw_figure(gather_figure(run, "errors"), "errors", width)
+        figure.draw_without_rendering()
+        upper, lower = (plot.yaxis.label.get_window_extent() for plot in figure.axes)
+    assert lower.y1 < upper.y0
+    assert lower.y0 >= 0.0
 
 
 @pytest.mark.parametrize(
