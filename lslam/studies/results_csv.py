@@ -76,8 +76,8 @@ def is_reusable(path: Path, folder: Path, digest: str) -> bool:
 VERSION = 3
 SCHEMA = "study_version"
 STAGE = "stage_ms."
-# Worked out from the others, for those who read the table elsewhere.
-FROM_OTHERS = ("is_diverged", "time_per_scan_ms")
+# Columns worked out from the others, for those who read the table elsewhere, and the property of a row that says each.
+FROM_OTHERS = {"is_diverged": "diverges", "time_per_scan_ms": "time_per_scan_ms"}
 # Python takes `1_000`, `nan` and `inf` for numbers too, and no parameter has such a value: they are words.
 _NUMBER = re.compile(r"-?(0|[1-9][0-9]*)(?P<rest>(\.[0-9]+)?([eE][+-]?[0-9]+)?)")
 _PLAIN = {f.name: str(f.type) for f in fields(StudyRow) if f.name not in ("parameters", "stages_ms")}
@@ -94,8 +94,8 @@ def study_columns(rows: Sequence[StudyRow]) -> dict[str, list[Value | None]]:
         table[name] = [getattr(row, name) for row in rows]
     for name in parameters:
         table[name] = [row.parameters.get(name) for row in rows]
-    for name in (*names[place:], *FROM_OTHERS):
-        table[name] = [_none_if_nan(getattr(row, name)) for row in rows]
+    for name, attribute in ({name: name for name in names[place:]} | FROM_OTHERS).items():
+        table[name] = [_none_if_nan(getattr(row, attribute)) for row in rows]
     for name in stages:
         table[STAGE + name] = [row.stages_ms.get(name) for row in rows]
     return table
