@@ -34,7 +34,7 @@ log = logging.getLogger("lslam")
 # rad; with a heading known no better, the points say nothing of which way a run goes.
 VAGUE = np.deg2rad(10.0)
 # Sentences of one run.
-MOST_SAID = 6
+MOST_MESSAGES = 6
 
 
 def with_control(
@@ -164,8 +164,8 @@ def contradicting(residuals: Many[ControlResidual], probability: float) -> list[
 
 
 def _some(texts: list[str], what: str) -> list[str]:
-    more = len(texts) - MOST_SAID
-    return [*texts[:MOST_SAID], f"and {more} more {what}"] if more > 0 else texts
+    more = len(texts) - MOST_MESSAGES
+    return [*texts[:MOST_MESSAGES], f"and {more} more {what}"] if more > 0 else texts
 
 
 class _Survey:

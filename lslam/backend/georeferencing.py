@@ -39,7 +39,7 @@ from lslam.registration.preprocessing.ground import world_up_of
 log = logging.getLogger("lslam")
 
 # m; of a fix that does not state its sigma.
-UNSTATED = 5.0
+USUAL_SIGMA_M = 5.0
 # m; least sigma of a fix, and by how much heights are worse than positions.
 MIN_SIGMA_M, VERTICAL_RATIO = 0.02, 1.8
 # With fewer fixes that agree there is no georeference.
@@ -201,7 +201,7 @@ def _usable(
     """The fixes taken during the run that have a position and a small enough sigma; or why there are too few."""
     stamps = np.array([r.stamp_ns for r in results], np.int64)
     stated = np.full(len(stream), config.sigma) if config.sigma is not None else stream.sigma
-    stated = np.maximum(np.where(np.isfinite(stated) & (stated > 0), stated, UNSTATED), MIN_SIGMA_M)
+    stated = np.maximum(np.where(np.isfinite(stated) & (stated > 0), stated, USUAL_SIGMA_M), MIN_SIGMA_M)
     inside = (stream.stamps_ns >= stamps[0]) & (stream.stamps_ns <= stamps[-1])
     good = inside & stream.is_place & (stated <= config.max_sigma)
     count = int(inside.sum())

@@ -10,7 +10,7 @@ from typing import Any
 
 # Bytes of a name: a disk takes 255 with all that is put behind it.
 _LONGEST = 120
-_SHOWN = 8  # names in a sentence
+_MOST_NAMES = 8  # names in a sentence
 
 
 def printable(text: str) -> str:
@@ -102,4 +102,6 @@ def first_of(names: Sequence[object]) -> str:
     >>> shown([1, 2]), shown(range(20))
     ('1, 2', '0, 1, 2, 3, 4, 5, 6, 7 and 12 more')
     """
-    return ", ".join(map(str, names[:_SHOWN])) + (f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else "")
+    return ", ".join(map(str, names[:_MOST_NAMES])) + (
+        f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
+    )

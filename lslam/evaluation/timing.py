@@ -12,8 +12,8 @@ from lslam.core.errors import InputError, input_errors
 from lslam.core.types.arrays import Floats, Longs
 from lslam.io.remote import as_path
 
-SAVED = "saved_s"
-NOT_STAGES = ("index", "stamp_ns", "stamp", "total", SAVED)
+IMU_SAVING = "saved_s"
+NOT_STAGES = ("index", "stamp_ns", "stamp", "total", IMU_SAVING)
 # Before the names of what is done after odometry.
 AFTER = "back end: "
 

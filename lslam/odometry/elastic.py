@@ -25,7 +25,7 @@ from lslam.registration.optimiser import STEP_M, STEP_RAD, Annealing, Correspond
 from lslam.registration.preprocessing.deskew import deskew_points
 from lslam.registration.preprocessing.prepare import PreparedPoints, subset
 from lslam.registration.residuals import find_residual
-from lslam.registration.result import LEAST_MATCHED, RegistrationResult
+from lslam.registration.result import MIN_MATCHES, RegistrationResult
 
 
 @dataclass(frozen=True)
@@ -205,7 +205,7 @@ def register_elastic(
         iterations += 1
         prior = sweep.prior
         H, g, facts = points.linearise(prior, (scale, annealing.end, np.inf))
-        if facts[at.MATCHED] < LEAST_MATCHED:
+        if facts[at.MATCHED] < MIN_MATCHES:
             break
         H, g = _about_own_place(H, g, sweep, shares, prior.pose[:3, 3])
         A, b = _of_ends_and_skew(H, g, shares)

@@ -28,7 +28,7 @@ SHORTEST_WALL_M = 0.3  # m; shorter walls are not aligned
 SEPARATION_ROUNDS = 20  # most rounds of separation
 STEPS = 10  # of Gauss-Newton
 CONTACT_SIGMA_M = 1e-4  # m; one sigma of a contact
-NESTED = 0.5  # share of the smaller building's area; a larger overlap on the map is a building part or a copy
+NESTED_SHARE = 0.5  # share of the smaller building's area; a larger overlap on the map is a building part or a copy
 log = logging.getLogger("lslam")
 
 
@@ -209,7 +209,7 @@ def remove_overlaps(buildings: Sequence[Building], displacements: Floats, inform
     information : (B, 3, 3) of these, 1/m2 and 1/rad2, positive definite: the weak prior included
 
     Buildings without contacts keep their displacement exactly. Canopies, buildings that begin above the ground and those
-    that overlap on the map by more than `NESTED` are not separated.
+    that overlap on the map by more than `NESTED_SHARE` are not separated.
     """
     targets = np.asarray(displacements, np.float64).reshape(-1, 3)
     if not len(targets):
@@ -259,7 +259,7 @@ def _pairs(solids: Sequence[Solid], rows: Longs) -> list[tuple[int, int]]:
 
 def _is_building_part(one: Solid, other: Solid) -> bool:
     shared = one.shape.intersection(other.shape).area
-    return bool(shared > NESTED * min(one.shape.area, other.shape.area))
+    return bool(shared > NESTED_SHARE * min(one.shape.area, other.shape.area))
 
 
 def _constrain(

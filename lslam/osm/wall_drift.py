@@ -30,11 +30,11 @@ SCALES = (0.25, 0.5, 1.0)
 # Level of significance for a larger constant share, which extrapolates farther where no wall is seen.
 SELDOM = 0.95
 # Hyperparameters of drift, degrees of freedom of the likelihood ratio test: scale and constant share. Rates are marginalised.
-FITTED = 2
+DRIFT_PARAMETERS = 2
 REWEIGHTINGS = 6
 # m between knots of varying rates, and the largest number of knots.
 KNOTS_APART_M, MOST = 20.0, 40
-SETTLED = 0.1  # of the expected squared Mahalanobis length of the rates
+MOST_CHANGE_SHARE = 0.1  # of the expected squared Mahalanobis length of the rates
 
 
 @dataclass(frozen=True)
@@ -270,8 +270,8 @@ def _fit_rates(
         found.reshape(-1, 3),
         np.asarray(at_knots @ new.reshape(-1, 3)),
         spread,
-        EstimatedDrift(-mean, sigma, gain, quantile(RIGHT_PROBABILITY, FITTED), rms),
-        is_final=float(new @ np.linalg.solve(covariance, new)) <= SETTLED * len(found),
+        EstimatedDrift(-mean, sigma, gain, quantile(RIGHT_PROBABILITY, DRIFT_PARAMETERS), rms),
+        is_final=float(new @ np.linalg.solve(covariance, new)) <= MOST_CHANGE_SHARE * len(found),
     )
 
 

@@ -32,8 +32,8 @@ CORNER_SPREAD_RAD = np.radians(8.0)  # by which the corners of a pair may differ
 LIKENESS = np.cos(np.radians(25.0))  # between the directions of a pair of walls
 CELL = np.array([0.75, 0.75, np.radians(4.0)])  # of the votes
 CORNERS = 40
-PROPOSALS = 150  # poses with the most votes; the best `REFINED` of them are refined
-REFINED = 12
+PROPOSALS = 150  # poses with the most votes; the best `MOST_REFINEMENTS` of them are refined
+MOST_REFINEMENTS = 12
 ROUGH = 2.5  # m; a pose of votes is right to about a cell
 SHORT = 4.0  # m; a wall of this length has half the weight of an infinite one
 # m, iteration by iteration. The last gate of the global match admits the errors of single buildings on the map, about a metre: a
@@ -47,7 +47,9 @@ START_WALLS = 4  # least walls of a start: the two of one corner would fit in ma
 REFINED_SLACK = np.array([0.5, 0.5, 0.03])  # m, m, rad; by which refinement may leave the window
 NEAR_SAME, LIKE_SAME = GATES[-1], np.radians(6.0)  # m and rad; poses that differ less pair the same walls
 BESIDE = 2.0  # m between the poses that are tried across parallel walls, the width of the first gates
-ALIGNED = np.sin(np.radians(12.0)) ** 2  # least information of an observed direction, as a part of the largest
+LEAST_INFORMATION = (
+    np.sin(np.radians(12.0)) ** 2
+)  # least information of an observed direction, as a part of the largest
 VISIBLE_M = 60.0  # m from the walls seen; the map beyond is left out
 
 
@@ -192,7 +194,7 @@ class _WallSearch:
             grid = np.ascontiguousarray(grid[:, :, :90])
         poses = wall_matching.peaks(grid, self.at, PROPOSALS, is_round)
         away = [self._fit(pose, ROUGH)[0] for pose in poses]
-        return np.asarray(poses[np.argsort(away, kind="stable")[:REFINED]])
+        return np.asarray(poses[np.argsort(away, kind="stable")[:MOST_REFINEMENTS]])
 
     def _beside(self, best: WallMatch) -> Floats:
         """Poses (K, 3) across the parallel walls of `best`, over the whole window; parallel walls have no corners that vote."""
@@ -240,7 +242,7 @@ def _deflate(normal: Floats) -> tuple[Floats, Floats, int]:
     Returns also the projector (2, 2) on the free directions, and the rank of the matrix.
     """
     values, axes = np.linalg.eigh(normal[:2, :2])
-    is_seen = (values >= ALIGNED * values[1]) & (values[1] > 0)
+    is_seen = (values >= LEAST_INFORMATION * values[1]) & (values[1] > 0)
     keep = np.zeros((3, 3))
     keep[:2, :2] = (axes * is_seen) @ axes.T
     keep[2, 2] = 1.0

@@ -33,7 +33,7 @@ from lslam.registration.preprocessing.ground import world_up_of
 log = logging.getLogger("lslam")
 
 CLOUD, AREAS = "changes.ply", "changes.geojson"
-INTERRUPTED = "interrupted while the drives were compared: nothing is written"
+INTERRUPTION = "interrupted while the drives were compared: nothing is written"
 # Red, green, blue of what vanished, is the same, and appeared; the scalar `change` is -1, 0 and 1.
 _COLOURS = np.array([[214, 69, 65], [150, 150, 150], [46, 134, 193]], np.uint8)
 
@@ -101,13 +101,13 @@ def compare_runs(
             for scan in scans:
                 mapper.add(scan.points, T @ scan.T_world_lidar)
 
-        for _, scan in posed_scans(sequence, results_of(run), run.config, watch, INTERRUPTED):
+        for _, scan in posed_scans(sequence, results_of(run), run.config, watch, INTERRUPTION):
             if scan is not None:
                 enter(cleaner.add(scan))
         enter(cleaner.finish())
         return mapper.evidence()
 
-    with asking(watch.should_stop, INTERRUPTED):
+    with asking(watch.should_stop, INTERRUPTION):
         before = cast(*old, np.eye(4))
         return changed_cells(cast(*new, T_old_new), before)
 

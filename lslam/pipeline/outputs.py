@@ -25,7 +25,7 @@ from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.sequence import Calibration
 from lslam.core.types.trajectory import Trajectory
 from lslam.evaluation.evaluate import Evaluation
-from lslam.evaluation.timing import AFTER, SAVED
+from lslam.evaluation.timing import AFTER, IMU_SAVING
 from lslam.io.formats.atomic import write_text
 from lslam.io.formats.point_files import write_ply
 from lslam.io.formats.trajectory_lines import write_kitti, write_tum
@@ -133,7 +133,7 @@ def timing_text(
     """
     back_end = back_end or {}
     later = list(dict.fromkeys(f"{AFTER}{name}" for row in back_end.values() for name in row))
-    lines = [",".join(["index", "stamp_ns", *names, "total", *later, *([SAVED] if saved_s else [])])]
+    lines = [",".join(["index", "stamp_ns", *names, "total", *later, *([IMU_SAVING] if saved_s else [])])]
     for k, (index, stamp, row) in enumerate(zip(indices, stamps_ns, seconds, strict=True)):
         own = back_end.get(k, {})
         values = (*row, row.sum(), *(own.get(name.removeprefix(AFTER), 0.0) for name in later))

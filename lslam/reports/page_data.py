@@ -34,7 +34,7 @@ FLAGS = {"degenerate": 8, "lost": 16}  # beside the status in one byte
 MOST_POSES = 5000  # of one of several trajectories on a map
 MOST_TRUTH = 5000  # points of ground truth under the map
 LONGEST_REASON = 160  # characters
-MOST_ASKED = 2000  # points whose neighbour is looked for
+MOST_QUERIES = 2000  # points whose neighbour is looked for
 MOST_KINDS = 8  # labels that have a colour of their own
 QUANTA = 65535  # of a coordinate over the extent of the cloud
 
@@ -159,7 +159,7 @@ def _spacing(points: Floats) -> float:
 
     if len(points) < 2:
         return 0.0
-    away = np.asarray(cKDTree(points).query(points[:MOST_ASKED], k=2)[0])
+    away = np.asarray(cKDTree(points).query(points[:MOST_QUERIES], k=2)[0])
     return float(np.median(away[:, 1]))
 
 

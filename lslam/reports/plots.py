@@ -37,7 +37,7 @@ ALIGNED = {
 }
 SHADES = 8  # of the style sheet that are all different
 PLAN_HEIGHT = 340  # of one beside a chart
-FAILED = (("failed", "bridged or skipped scan"),)  # legend of the marks of such scans
+FAILURE_LEGEND = (("failed", "bridged or skipped scan"),)  # legend of the marks of such scans
 Legend = tuple[tuple[str, str], ...]
 # A limit further away than this many times the usual scan would press the stages flat: an arrow says where it is.
 LIMIT_IN_VIEW = 4.0
@@ -101,7 +101,7 @@ def trajectory_figures(record: RunRecord, evaluation: Evaluation | None) -> list
     top = plane_chart(tracks, "trajectory from above", points=failed, tallest=PLAN_HEIGHT, by=along[0])
     lines = [] if truth is None else [svg.Line("ground truth", distance, truth[:, 2], "gt")]
     lines.append(svg.Line("estimate", distance, positions[:, 2], "s1"))
-    more = (("start", "start"), ("end", "end"), *((("bad", FAILED[0][1]),) if len(failed) else ()))
+    more = (("start", "start"), ("end", "end"), *((("bad", FAILURE_LEGEND[0][1]),) if len(failed) else ()))
     return [
         Figure("Trajectory from above", top, legend_of(tracks) + more, caption),
         line_figure("Height", lines, x_label, "height z, m", caption, spoken="height profile", zero=False, by=along[1]),
@@ -173,7 +173,7 @@ def registration_figures(record: RunRecord) -> list[Figure]:
         if not any(np.any(np.isfinite(v) & (v != 0)) for v in values):
             continue
         lines = numbered_lines([words.get(f, f) for f in fields], index, values)
-        legend, more = None if len(lines) > 1 else (), FAILED if len(failed) else ()
+        legend, more = None if len(lines) > 1 else (), FAILURE_LEGEND if len(failed) else ()
         chart: dict[str, Any] = {"spoken": f"{title} per scan", "marks": failed, "whole_x": True, "by": "scan"}
         figures.append(line_figure(title, lines, "scan", y_label, legend=legend, more=more, **chart))
     return figures
@@ -204,7 +204,11 @@ def uncertainty_figures(record: RunRecord) -> list[Figure]:
         ("Position uncertainty", "m", XYZ, sigma[:, :3]),
         ("Rotation uncertainty", "deg", ("about x", "about y", "about z"), np.degrees(sigma[:, 3:])),
     ):
-        lines, marks, more = numbered_lines(names, distance, values.T), distance[failed], FAILED if failed.any() else ()
+        lines, marks, more = (
+            numbered_lines(names, distance, values.T),
+            distance[failed],
+            FAILURE_LEGEND if failed.any() else (),
+        )
         figures.append(line_figure(title, lines, WAY, f"sigma, {unit}", recipe, more=more, marks=marks, by="way"))
     return [figure for figure in figures if figure.svg]
 

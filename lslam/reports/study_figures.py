@@ -16,7 +16,7 @@ from lslam.evaluation.curves import FLAT_SHARE, NOT_REGISTRATION, band, normalis
 from lslam.reports.picture import COLOURS, house_style, label, pictures
 
 POINTS = ("o", ".", "x")  # markers; lines without say nothing
-LOST = "x"
+LOST_MARKER = "x"
 
 
 class PicturePoint(NamedTuple):
@@ -45,7 +45,7 @@ def picture_points(figure: Any, cross: str) -> list[PicturePoint]:
             for (x, y), (left, up), half in zip(data, places, halves, strict=True):
                 if not (np.isfinite([left, up]).all() and 0 <= up <= 1):
                     continue
-                value = cross if line.get_marker() == LOST else _value_text(ordinate, _number(y) + half)
+                value = cross if line.get_marker() == LOST_MARKER else _value_text(ordinate, _number(y) + half)
                 words = (title, name, _value_text(abscissa, _tick(plot, x)), value)
                 text = ", ".join(word for word in words if word)
                 found.append(PicturePoint(round(float(left), 4), round(float(1 - up), 4), text))
@@ -119,7 +119,7 @@ _LAW = (
 _EFFICIENCY = (
     "Median over seeds, each curve over its own largest; a lost run counts as 0; squares: within 10 % of the largest."
 )
-_LOST = "more than half of the runs lost"
+_LOST_LABEL = "more than half of the runs lost"
 _LEGEND_WIDTH = 130  # characters of a line, with six for each handle
 _LOG_RATIO = 30.0  # of the largest to the smallest error, above which the axis is logarithmic
 
@@ -150,7 +150,7 @@ def study_figures(result: StudyResult) -> Iterator[StudyFigure]:
             of_thesis = THESIS.get(result.parameters[0], {}).get(name, "")
             more = f" Girolimetto, figure {of_thesis}." if of_thesis else ""
             png, svg = pictures(figure, ("png", "svg"))
-            yield StudyFigure(name, title, caption + more, png, svg, picture_points(figure, _LOST))
+            yield StudyFigure(name, title, caption + more, png, svg, picture_points(figure, _LOST_LABEL))
 
 
 def _errors(figure: Any, result: StudyResult, curves: Sequence[CurveResult]) -> bool:

@@ -139,7 +139,7 @@ CORRIDOR = 2.4  # m wide
 # It is open at both ends, and beyond them there is nothing that a LiDAR sees: what tells how far along one is, is the
 # stairwell alone, and that is soon out of sight.
 BEHIND, AHEAD = 30.0, 70.0  # m of corridor
-WALKED = 36.0  # m of it that are walked
+WALK_M = 36.0  # m of it that are walked
 TURNING = WIDTH / 2 + WALL / 2  # m, radius of the turns on the landings
 
 
@@ -162,7 +162,7 @@ def stairs_line(above: float) -> tuple[RouteCurve, tuple[Floats, Floats]]:
     x = -LANDING - CORRIDOR / 2
     out = np.linspace(0, np.pi / 2, 7)
     parts.append(np.column_stack([x + 1.0 - portable.sin(out), TURNING + 1.0 - portable.cos(out), np.full(7, TOP)]))
-    parts.append(np.array([[x, TURNING + WALKED, TOP]]))
+    parts.append(np.array([[x, TURNING + WALK_M, TOP]]))
     points = np.concatenate(parts)
     points = points[np.append(True, np.linalg.norm(np.diff(points[:, :2], axis=0), axis=1) > 1e-6)]
     line = smooth_curve(points[:, :2], False, 0.3)

@@ -37,7 +37,7 @@ STOREY_M = 3.0  # m
 PARAPET = 0.4  # m of wall above a flat roof
 OVERHANG = 0.3  # m, eaves beyond the walls
 SLAB = 0.2  # m, the roof of a canopy
-GABLED = ("gabled", "hipped", "half-hipped", "saltbox")  # tags whose roof is drawn with two slopes
+GABLE_SHAPES = ("gabled", "hipped", "half-hipped", "saltbox")  # tags whose roof is drawn with two slopes
 FLAT = ("flat", "skillion", "round", "dome")
 
 
@@ -274,7 +274,7 @@ class _Gable:
 def _gable(building: Building, footprint: Footprint, style: _FacadeStyle) -> _Gable | None:
     """Gabled roof of a building with a suitable outline, None for a flat roof."""
     shape = building.tags.get("roof:shape", "")
-    if footprint.holes or shape in FLAT or not (shape in GABLED or style.likes_gables):
+    if footprint.holes or shape in FLAT or not (shape in GABLE_SHAPES or style.likes_gables):
         return None
     polygon = footprint_polygon(footprint).simplify(0.02)
     corners = np.array(polygon.exterior.coords)[:-1]

@@ -36,7 +36,7 @@ _PROBE = 0.2  # s
 DISTANCE_CELL_M = 1.0  # m, of the raster of distances to walls
 SHIFT = 4.0  # m between the places that are tried
 HEADINGS = 72
-SEEN = 50.0  # m: a place on the line counts when a wall is that near; nothing is known farther from the map
+VISIBILITY_M = 50.0  # m: a place on the line counts when a wall is that near; nothing is known farther from the map
 _ROADS = ("motorway", "trunk", "primary", "secondary", "tertiary")
 DRIVABLE = (
     *_ROADS,
@@ -211,7 +211,7 @@ def _distances(buildings: Sequence[Building]) -> tuple[Floats, NDArray[np.float3
     from shapely import contains_xy
 
     solid = solid_ground(buildings, 0.5 * DISTANCE_CELL_M)
-    bounds = np.array(solid.bounds).reshape(2, 2) + np.array([[-SEEN], [SEEN]])
+    bounds = np.array(solid.bounds).reshape(2, 2) + np.array([[-VISIBILITY_M], [VISIBILITY_M]])
     x, y = (np.arange(bounds[0, k], bounds[1, k], DISTANCE_CELL_M) for k in (0, 1))
     inside = contains_xy(solid, *np.meshgrid(x, y, indexing="ij"))
     return bounds[0], np.asarray(DISTANCE_CELL_M * distance_transform_edt(~inside), np.float32)
@@ -230,7 +230,7 @@ def _free_shifts(line: Floats, low: Floats, distance: NDArray[np.float32], margi
         on_map = ((cell >= 0) & (cell < distance.shape)).all(axis=1)
         away = distance[tuple(np.where(on_map[:, None], cell, 0).T)]
         free = on_map & (away > margin)
-        shifts, seen = shifts[free], seen[free] + (away[free] <= SEEN)
+        shifts, seen = shifts[free], seen[free] + (away[free] <= VISIBILITY_M)
         if not len(shifts):
             break
     return shifts, seen

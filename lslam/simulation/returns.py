@@ -30,7 +30,7 @@ FLATTEST = 0.1  # cosine of incidence: what is met still flatter errs no more th
 REFERENCE = 0.4  # share of light that comes back at which a LiDAR's ranges are calibrated
 SLANT = 2.0  # times the step of a slanted surface between two rays: more is an edge
 _TABLE = 1 << 16
-_TEXTURED = {
+_TEXTURES = {
     "ground": (Surface.ROAD, Surface.PAVEMENT, Surface.LAWN),
     "walls": (Surface.WALL, Surface.ROOF, Surface.FENCE, Surface.TRUNK),
 }
@@ -204,7 +204,7 @@ def errors(returns: Returns, model: LidarModel, rays: Rays, hits: Hits, rng: np.
         lawn = np.flatnonzero(hits.surface == Surface.LAWN)
         blades = np.abs(rng.standard_normal(len(lawn), np.float32)) * np.float32(returns.grass)
         late[lawn] -= np.minimum(blades / cosine[lawn], distance[lawn] / 2)
-    for deviation, surfaces in zip((returns.ground_texture, returns.wall_texture), _TEXTURED.values(), strict=True):
+    for deviation, surfaces in zip((returns.ground_texture, returns.wall_texture), _TEXTURES.values(), strict=True):
         if deviation > 0:
             has_texture = np.zeros(len(Surface), np.bool_)
             has_texture[list(surfaces)] = True

@@ -27,7 +27,7 @@ from lslam.simulation.returns import Returns
 Shape = Callable[[np.random.Generator], Floats]
 
 ARC_M = 1.0  # m between the points of arcs
-_CLOSED = [(0, 0), (190, 0), (235, 25), (235, 150), (120, 150), (120, 95), (0, 95)]
+_CLOSED_CORNERS = [(0, 0), (190, 0), (235, 25), (235, 150), (120, 150), (120, 95), (0, 95)]
 _OPEN = [(0, 0), (125, 0), (125, 105), (260, 125), (300, 190)]
 _RESIDENTIAL = [
     (0, 0),
@@ -123,7 +123,7 @@ def _straight(length: float) -> Shape:
 
 
 SHAPES: dict[str, tuple[Shape, bool]] = {
-    "closed": (lambda _: round_corners(_CLOSED, 30.0, True), True),
+    "closed": (lambda _: round_corners(_CLOSED_CORNERS, 30.0, True), True),
     "open": (lambda _: round_corners(_OPEN, 32.0, False), False),
     "spiral": (lambda _: spiral(45.0, 21.0, 1.75), False),
     "eight": (lambda _: eight(45.0, 37.0, 11.0), True),

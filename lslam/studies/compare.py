@@ -43,7 +43,7 @@ from lslam.studies.subjects import Scene, Subject, count_scans, find_subjects, s
 from lslam.studies.variants import Imu, Variant, find_variants
 
 log = logging.getLogger("lslam")
-PREFERRED = EvalConfig(align=("se3", "origin"))
+PAIR_EVALUATION = EvalConfig(align=("se3", "origin"))
 # rad; half a metre at a wall that stands 30 m beside the path.
 LARGEST_TURN = 1 / 60
 # More than this many busy cores before the first run, and its times are somebody else's too.
@@ -137,7 +137,7 @@ def _only_warnings() -> Iterator[None]:
 def _in_world_of_truth(
     sequence: str, seed: int, runs: Sequence[UsableRun], recording: Recording, truth: Trajectory
 ) -> Drawing:
-    scores = [evaluate(run.trajectory, truth, PREFERRED, calibration=recording.calibration) for run in runs]
+    scores = [evaluate(run.trajectory, truth, PAIR_EVALUATION, calibration=recording.calibration) for run in runs]
     errors = [_available(list(score.ate.values())) for score in scores]
     turns = [_turn_about_path(error, score.gt_positions) for error, score in zip(errors, scores, strict=True)]
     # One alignment for all, or their errors could not be compared.
@@ -203,7 +203,7 @@ def _differences(sequence: str, runs: Sequence[UsableRun]) -> list[Difference]:
         if run.job.method == reference:
             continue
         try:
-            score = evaluate(run.trajectory, other.trajectory, PREFERRED)
+            score = evaluate(run.trajectory, other.trajectory, PAIR_EVALUATION)
         except LslamError as error:
             log.warning("%s: %s and %s cannot be compared: %s", sequence, run.job.method, reference, error)
             continue

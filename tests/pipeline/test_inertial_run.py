@@ -113,7 +113,7 @@ def test_a_method_that_registers_nothing_does_not_pass_for_accurate() -> None:
 def test_results_are_the_same_twice_and_without_the_comparison(monkeypatch: pytest.MonkeyPatch) -> None:
     """What constant velocity would have taken is tried on the side: not a bit of the result depends on it."""
     assert sum(r.imu.saved_s is not None for r in runs()[1].record.results) >= 2
-    monkeypatch.setattr(InertialMotion, "COMPARED", 10**6)
+    monkeypatch.setattr(InertialMotion, "COMPARISON_INTERVAL_SCANS", 10**6)
     again = run(with_imu(imu_of(walk())), config_of("input.threads=1"))
     np.testing.assert_array_equal(again.trajectory.poses, runs()[1].trajectory.poses)
 
@@ -122,7 +122,7 @@ def test_results_are_the_same_twice_and_without_the_comparison(monkeypatch: pyte
 def test_scans_csv_is_the_same_twice_and_times_are_in_timing_csv(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(InertialMotion, "COMPARED", 5)
+    monkeypatch.setattr(InertialMotion, "COMPARISON_INTERVAL_SCANS", 5)
     config = config_of("input.count=24", "imu.start_s=1.5")
     for name in ("first", "second"):
         run(with_imu(imu_of(walk())), config, out=tmp_path / name)

@@ -31,7 +31,7 @@ from lslam.registration.preprocessing.prepare import NO_TIMES
 
 Labels = NDArray[np.uint16]
 INDEX = "index.npz"
-CACHED = 32
+CACHE_CLOUDS = 32
 # Ends the names of arrays whose bytes are a frame of zstd.
 ZST = ".zst"
 
@@ -53,7 +53,7 @@ class KeyframeStore(Stateful):
     (1, [[1.0, 1.0, 1.0], [1.0, 1.0, 1.0]])
     """
 
-    def __init__(self, folder: Path | None = None, cache_size: int = CACHED, deflate: int = 1) -> None:
+    def __init__(self, folder: Path | None = None, cache_size: int = CACHE_CLOUDS, deflate: int = 1) -> None:
         self.folder = folder
         self.keyframes: list[Keyframe] = []
         # The number by which the cloud of each was added.

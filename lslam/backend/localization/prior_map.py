@@ -45,7 +45,7 @@ from lslam.registration.preprocessing.ground import Z
 # m, edge of the blocks that points are sorted into; the local map is made anew where the sensor enters another.
 BLOCK_M = 32.0
 # Local maps kept: a drive along the border of two blocks needs both.
-KEPT = 3
+CACHE_ALIGNMENTS = 3
 # Points that the vertical is estimated from, at most, and that one insertion takes.
 LOOKED_AT, AT_ONCE = 400_000, 1 << 17
 # On a map of another day no earlier scan tells how many points can agree: the shares of a scan that the map has, and that agree.
@@ -152,7 +152,7 @@ class LocalView:
         if block not in self._alignments:
             self._alignments[block] = self._make(block)
         self._alignments.move_to_end(block)
-        while len(self._alignments) > KEPT:
+        while len(self._alignments) > CACHE_ALIGNMENTS:
             self._alignments.popitem(last=False)
         return self._alignments[block]
 

@@ -46,7 +46,7 @@ TURN_STEP, WIDEST_TURN = np.deg2rad(2.0), np.deg2rad(20.0)
 # differ by twice as much.
 RIVAL, RIVALS = 1.5, 3
 # Level submaps, clouds and gates cached, and how many submaps serve to estimate the vertical.
-KEPT, CLOUDS, HELD, LOOKS = 4, 4, 256, 8
+CACHE_SUBMAPS, CLOUDS, CACHE_GATES, LOOKS = 4, 4, 256, 8
 
 
 class Detector:
@@ -76,7 +76,9 @@ class Detector:
         self._index_lock = threading.Lock()
         self._described = SharedResults(self._describe)
         self._clouds = SharedResults(self._make_level, CLOUDS)
-        self._submaps = SharedResults(lambda n: make_level_submap(self._clouds.get(n), self.registration), KEPT)
+        self._submaps = SharedResults(
+            lambda n: make_level_submap(self._clouds.get(n), self.registration), CACHE_SUBMAPS
+        )
         # Submaps overlap: the first keyframe of every few metres represents those after it.
         steps = np.floor(self.uncertainty.distances / (NEAR_M / 2))
         self._is_described = np.diff(steps, prepend=-1.0) > 0
@@ -100,14 +102,14 @@ class Detector:
                     places, self.uncertainty.distances, self.config.memory_places, self.config.min_travel
                 )
         # Of thousands of keyframes, each has thousands: those of the next few are held.
-        gated = SharedResults(self._gate, HELD)
+        gated = SharedResults(self._gate, CACHE_GATES)
         ahead: dict[int, tuple[Longs, Future[list[LoopCandidate]]]] = {}
         with ThreadPoolExecutor(threads, "lslam-loops") as pool:
             try:
                 for b, keyframe in enumerate(self.keyframes):
                     _stop_if(should_stop(), b, count)
                     if self.memory.reach(b):
-                        gated = SharedResults(self._gate, HELD)
+                        gated = SharedResults(self._gate, CACHE_GATES)
                     older = gated.get(b)
                     if len(older) == 0:
                         throttle.reset()
@@ -155,7 +157,7 @@ class Detector:
         """The next keyframes after `b` that are due if all verdicts are as the last one."""
         throttle = copy(throttle)
         throttle.observe(self.keyframes[b].distance, throttle.last or Verdict.ACCEPTED)
-        for n in range(b + 1, min(b + HELD, len(self.keyframes))):
+        for n in range(b + 1, min(b + CACHE_GATES, len(self.keyframes))):
             if len(gates.get(n)) == 0:
                 throttle.reset()
             elif throttle.is_due(self.keyframes[n].distance):

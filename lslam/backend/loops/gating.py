@@ -221,7 +221,7 @@ class SharedResults(Generic[T]):
 
 
 # Places of one verified loop that are retrieved at each new place, as in the paper.
-RETRIEVED = 2
+MOST_RETRIEVALS = 2
 # Places on either side of a verified loop that it retrieves and protects from transfer.
 LOOP_PLACES = 10
 
@@ -316,7 +316,7 @@ class WorkingMemory:
         for step in range(1, LOOP_PLACES + 1):
             for place in (loop + step, loop - step):
                 before = len(self._members)
-                if entered < RETRIEVED and 0 <= place < self._newest:
+                if entered < MOST_RETRIEVALS and 0 <= place < self._newest:
                     self._enter(place)
                 entered += len(self._members) - before
 

@@ -135,7 +135,7 @@ Spectrum = NDArray[np.complex64]
 CELL_M = 1.0
 # Voxels per cell that count, at most: taller structure is no more distinctive.
 MOST_VOXELS = 6.0
-UNTURNED: Floats = np.eye(2)
+NO_ROTATION: Floats = np.eye(2)
 
 
 @dataclass(frozen=True)
@@ -151,7 +151,7 @@ class BevGrid:
         inside = np.asarray(((cells >= 0) & (cells < self.size)).all(axis=1))
         return np.where(inside, cells[:, 0] * self.size + cells[:, 1], 0), inside
 
-    def view(self, points: Floats, ground: Floats, R: Floats = UNTURNED) -> Image:
+    def view(self, points: Floats, ground: Floats, R: Floats = NO_ROTATION) -> Image:
         """(3, size, size) of what stands there, points (N, 3), m, and of the ground (M, 3), turned by R (2, 2) first.
 
         Structure: occupied voxels per cell, up to `MOST_VOXELS`; points are means of voxels. Its square. Visibility: 1 in cells

@@ -36,7 +36,7 @@ T = TypeVar("T")
 # Said once, at the beginning: where lslam's own bags keep what else is known of a sequence, as `sequence.toml`.
 INFO_TOPIC = "/lslam/sequence"
 _ENCODINGS = ("cdr", "ros1")
-_SAID = 3  # damaged messages that are named one by one
+_MOST_MESSAGES = 3  # damaged messages that are named one by one
 _ZSTD = b"\x28\xb5\x2f\xfd"  # ROS 2 can compress every message by itself
 _ZSTD_BLOCK = 1 << 18  # more than the largest block of zstd
 _TRANSFORMS = "tf2_msgs/msg/TFMessage"
@@ -162,9 +162,9 @@ class Bag:
                 broken.append(str(error))
             else:
                 yield k, value
-        problems.extend(broken[:_SAID])
-        if len(broken) > _SAID:
-            problems.append(f"{len(broken) - _SAID} more messages of {topic.name} are damaged")
+        problems.extend(broken[:_MOST_MESSAGES])
+        if len(broken) > _MOST_MESSAGES:
+            problems.append(f"{len(broken) - _MOST_MESSAGES} more messages of {topic.name} are damaged")
 
     def decode(self, topic: BagTopic, data: bytes) -> Any:
         """A message as an object with the fields of its type. Raises InputError when it does not fit the type."""

@@ -10,7 +10,7 @@ from lslam.core.printable import first_of
 
 SUFFIXES = (".bag", ".bag.active", ".mcap", ".db3")
 # Endings of files that were compressed as a whole, as recorders and people do.
-PACKED = {".zstd": "zstd", ".zst": "zstd", ".lz4": "lz4", ".gz": "gz", ".bz2": "bz2", ".xz": "xz"}
+COMPRESSIONS = {".zstd": "zstd", ".zst": "zstd", ".lz4": "lz4", ".gz": "gz", ".bz2": "bz2", ".xz": "xz"}
 # Captures of the packets of a sensor.
 CAPTURES = (".pcap", ".pcapng")
 METADATA = "metadata.yaml"
@@ -101,7 +101,7 @@ def suffix_of(path: Path) -> str:
 
 def packing_of(path: Path) -> str:
     """How a file is compressed as a whole, by its name; empty where it is not."""
-    return next((kind for ending, kind in PACKED.items() if path.name.lower().endswith(ending)), "")
+    return next((kind for ending, kind in COMPRESSIONS.items() if path.name.lower().endswith(ending)), "")
 
 
 def stem_of(path: Path) -> str:
@@ -110,7 +110,7 @@ def stem_of(path: Path) -> str:
 
 
 def _unpack_name(name: str) -> str:
-    ending = next((e for e in PACKED if name.lower().endswith(e)), "")
+    ending = next((e for e in COMPRESSIONS if name.lower().endswith(e)), "")
     return name[: len(name) - len(ending)]
 
 

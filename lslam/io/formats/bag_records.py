@@ -20,7 +20,7 @@ from lslam.core.errors import InputError
 from lslam.io.formats.bag_chunks import IN_FILE, PACKED_BLOCK, Chunk, ChunkFile, CutOffError, Topic
 
 # What reading a damaged record ends in.
-BROKEN = (CutOffError, struct.error, LookupError, ValueError, OverflowError)
+READ_ERRORS = (CutOffError, struct.error, LookupError, ValueError, OverflowError)
 _HEAD = 1 << 12  # bytes that hold the headers of a record and of its message
 INDICES = 8192  # bytes of the indices of a chunk, about
 _COMPRESSIONS = ("", "bz2", "lz4", "zstd")
@@ -89,7 +89,7 @@ class ChunkedBag(ABC):
             data = self._file.part(chunk, record.data, size, is_head)
             if record.op != self.MESSAGE or len(data) < size:
                 raise CutOffError
-        except BROKEN:
+        except READ_ERRORS:
             raise InputError(f"{self.path}: message {k} of {topic.name} is damaged") from None
         return data
 
@@ -178,7 +178,7 @@ class ChunkedBag(ABC):
                     loose[channel].append((stamp, position))
                 elif record.op in self.NAMES:
                     self._note_name(record, self._file.part(None, record.data, record.size))
-            except BROKEN:
+            except READ_ERRORS:
                 lost = size - position
                 self.loss = (
                     f"{self.path} is cut off: the last {lost} of its {size} bytes ({lost / size:.1%}) hold no whole "
@@ -252,7 +252,7 @@ class ChunkedBag(ABC):
                     raise CutOffError
                 use(record, offset)
                 offset = record.end
-        except (InputError, *BROKEN):
+        except (InputError, *READ_ERRORS):
             damage = f"{self.path}: the chunk at byte {chunk.position} is damaged and its messages are lost"
             self.loss = self.loss or damage
         return offset

@@ -20,8 +20,8 @@ _WAY_OUT = "install it with: pip install pillow"
 # Pixels at most: more is no camera's image, and fills the memory.
 _MOST = 1 << 27
 # Of uncompressed ROS images: channels, and which of them are red, green and blue.
-_PACKED = {"rgb8": (3, (0, 1, 2)), "bgr8": (3, (2, 1, 0)), "rgba8": (4, (0, 1, 2)), "bgra8": (4, (2, 1, 0))}
-_PACKED |= {"8UC3": (3, (2, 1, 0)), "8UC4": (4, (2, 1, 0)), "mono8": (1, (0, 0, 0)), "8UC1": (1, (0, 0, 0))}
+_ENCODINGS = {"rgb8": (3, (0, 1, 2)), "bgr8": (3, (2, 1, 0)), "rgba8": (4, (0, 1, 2)), "bgra8": (4, (2, 1, 0))}
+_ENCODINGS |= {"8UC3": (3, (2, 1, 0)), "8UC4": (4, (2, 1, 0)), "mono8": (1, (0, 0, 0)), "8UC1": (1, (0, 0, 0))}
 # Where red is in a cell of two by two pixels; blue is across from it.
 _BAYER = {"bayer_rggb8": (0, 0), "bayer_bggr8": (1, 1), "bayer_gbrg8": (1, 0), "bayer_grbg8": (0, 1)}
 # Tags of TIFF and keys of GeoTIFF (OGC 19-008r4), and GDAL's own tag for pixels without a value.
@@ -61,9 +61,9 @@ def from_pixels(data: NDArray[np.uint8], width: int, height: int, step: int, enc
     Raises InputError naming `source` for an encoding that is not read, and for too few bytes.
     """
     kind = encoding.split(";")[0].strip()
-    channels, order = (1, (0, 0, 0)) if kind in _BAYER else _PACKED.get(kind, (0, (0, 0, 0)))
+    channels, order = (1, (0, 0, 0)) if kind in _BAYER else _ENCODINGS.get(kind, (0, (0, 0, 0)))
     if not channels:
-        known = ", ".join([*_PACKED, *_BAYER])
+        known = ", ".join([*_ENCODINGS, *_BAYER])
         raise InputError(f"{source}: images in {encoding} are not read, only {known}")
     if step < width * channels or len(data) < step * height or not width * height:
         raise InputError(f"{source}: {len(data)} bytes are no {width} x {height} pixels in {encoding}")

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 _VLR, _EVLR = 54, 60  # bytes of their headers
 _LASZIP = b"laszip encoded"
-_LAYERED = 3  # the compressor of point formats 6 and above: every field of a chunk lies by itself
+_LAYERED_COMPRESSOR = 3  # the compressor of point formats 6 and above: every field of a chunk lies by itself
 # Fields of the items of layered chunks; those of bytes are as many as the bytes.
 _LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
 _EXTRA_BYTES = 14
@@ -117,7 +117,7 @@ def _laszip(stream: BinaryIO, begin: int, vlrs: int, record: int) -> tuple[lazrs
             compressor, items = struct.unpack_from("<H30xH", data)
             kinds = list(struct.iter_unpack("<HHH", data[34 : 34 + 6 * items]))
             layers = sum(size if kind == _EXTRA_BYTES else _LAYERS.get(kind, 0) for kind, size, _ in kinds)
-            return laszip, layers if compressor == _LAYERED else 0
+            return laszip, layers if compressor == _LAYERED_COMPRESSOR else 0
         position += _VLR + length
     raise ValueError("nothing says how its points are compressed")
 

@@ -25,7 +25,7 @@ WAY_OUT = "fetch the extract again"
 _BEFORE = b"\xef\xbb\xbf\xff\xfe\0 \t\r\n"
 _UTF16 = (b"\xff\xfe", b"\xfe\xff")
 # First bytes of gzip, bzip2, xz, zip and Zstandard.
-_COMPRESSED = (b"\x1f\x8b", b"BZh", b"\xfd7zXZ", b"PK\x03\x04", b"\x28\xb5\x2f\xfd")
+_COMPRESSION_MARKS = (b"\x1f\x8b", b"BZh", b"\xfd7zXZ", b"PK\x03\x04", b"\x28\xb5\x2f\xfd")
 _PARTS = {"FeatureCollection": "features", "GeometryCollection": "geometries"}
 KINDS = (*_PARTS, "Feature", "Polygon", "MultiPolygon")
 # What names the one coordinate system that RFC 7946 allows; older files say it in so many ways.
@@ -42,7 +42,7 @@ def read_osm(path: Path) -> OsmData:
     with input_errors(path):
         with path.open("rb") as stream:
             start = stream.read(64)
-        if start.startswith(_COMPRESSED) or b"OSMHeader" in start:
+        if start.startswith(_COMPRESSION_MARKS) or b"OSMHeader" in start:
             raise InputError(
                 f"{path} is compressed: turn it into plain XML first (gunzip, bunzip2, or osmium cat -o map.osm)"
             )

@@ -111,7 +111,7 @@ LABEL_NAMES = (
 _DOUBTFUL_TIMES = {"curvature": "ms"}
 # Before `_sec` and `_nsec`, where it is none of `TIME_NAMES`.
 _CLOCKS = ("", "lidar", "sensor", "point", "utc", "gps", "header", "epoch")
-ORGANISED = "(shorter side)"
+SHORTER_SIDE = "(shorter side)"
 # A field of another name than ring with fewer values numbers the heads of a sensor, with more its columns; the values of a
 # small cloud say nothing.
 _FEWEST_RINGS, _MOST_RINGS, _TOO_SMALL = 4, 300, 100
@@ -178,7 +178,7 @@ def ring_column(rows: int, cols: int) -> dict[str, NDArray[Any]]:
     """Ring of each point of an organised cloud, as a column along its shorter side; empty for an unorganised cloud."""
     if min(rows, cols) < 2:
         return {}
-    return {ORGANISED: np.asarray(np.divmod(np.arange(rows * cols), cols)[0 if rows <= cols else 1], np.uint32)}
+    return {SHORTER_SIDE: np.asarray(np.divmod(np.arange(rows * cols), cols)[0 if rows <= cols else 1], np.uint32)}
 
 
 def beyond(count: int, more: int) -> dict[str, NDArray[Any]]:
@@ -263,7 +263,7 @@ def cloud_from_fields(
         labels,
         tuple(_clocks(names, columns)),
         tuple(fields),
-        tuple(name for name in columns if name not in (*fields, ORGANISED) and plain_name(name)),
+        tuple(name for name in columns if name not in (*fields, SHORTER_SIDE) and plain_name(name)),
     )
 
 

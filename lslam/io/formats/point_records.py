@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from lslam.core.types.arrays import Floats
 
 # Records of mixed types: of Livox, Ouster, Velodyne, Aeva, Hesai and RoboSense drivers, packed and padded as PCL does.
-_MIXED = (
+_MIXED_RECORDS = (
     "x y z intensity:u1 _:u1 _:u1 time:u4",
     "x y z intensity time:u4",
     "x y z intensity ring:u2 time",
@@ -165,7 +165,7 @@ def _valid_rows(table: Floats) -> Floats:
 
 def _candidates(files: Sequence[NDArray[np.uint8]]) -> list[PointRecord]:
     """Records of mixed types, and those of one type with their columns named by the values."""
-    candidates = [parse_record(text) for text in _MIXED]
+    candidates = [parse_record(text) for text in _MIXED_RECORDS]
     for code, counts in (("<f4", _COLUMNS_F4), ("<f8", _COLUMNS_F8), (">f4", (3, 4, *_COLUMNS_F4[1:]))):
         for count in counts:
             tables = _whole(PointRecord(("_",) * count, (code,) * count), files)

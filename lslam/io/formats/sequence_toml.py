@@ -27,9 +27,9 @@ REFERENCES = ("start", "end", "absolute")
 POINT_TIMES = ("field", "columns", "order", "azimuth", "none")
 FRAMES = ("lidar", "cam0", "imu")
 EXTRINSICS = ("T_cam0_lidar", "T_lidar_imu", "T_lidar_gnss")
-_NEEDED = ("images", "intrinsics", "T_lidar_camera")  # of a camera
+_NECESSARY_CAMERA_KEYS = ("images", "intrinsics", "T_lidar_camera")  # of a camera
 _LARGEST = 1e9  # of a number of a camera: seconds beyond have no stamps, pixels no image
-CAMERA_KEYS = (*_NEEDED, "stamps", "model", "distortion", "time_offset_s")
+CAMERA_KEYS = (*_NECESSARY_CAMERA_KEYS, "stamps", "model", "distortion", "time_offset_s")
 
 
 def is_rate(rate_hz: float) -> bool:
@@ -255,11 +255,13 @@ def _camera(path: Path | str, name: str, table: Any) -> CameraInfo:
     """Camera of the table `[cameras.NAME]`. Raises InputError naming file and key."""
     place = f"cameras.{name}"
     if not isinstance(table, dict):
-        raise InputError(f"{path}: {place} is a table, write [{place}] and below it {', '.join(_NEEDED)}")
+        raise InputError(
+            f"{path}: {place} is a table, write [{place}] and below it {', '.join(_NECESSARY_CAMERA_KEYS)}"
+        )
     for key in table:
         if key not in CAMERA_KEYS:
             raise InputError(f"{path}: unknown key {place}.{key}; {nearest(key, CAMERA_KEYS)}")
-    for key in _NEEDED:
+    for key in _NECESSARY_CAMERA_KEYS:
         if key not in table:
             what = "has no calibration" if key in ("intrinsics", "T_lidar_camera") else "has no images"
             raise InputError(f"{path}: camera {name} {what}: {place}.{key} is missing")

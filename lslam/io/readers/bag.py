@@ -24,7 +24,7 @@ from lslam.io.formats.bag_streams import Stream, chain, is_static, read_poses
 from lslam.io.formats.point_cloud import TIME_NAMES, PointCloud
 from lslam.io.formats.sensor_messages import can_decode
 from lslam.io.formats.sequence_toml import LENGTHS, SequenceInfo, parse_sequence_toml
-from lslam.io.readers.bag_lidars import UNNAMED, Halves, Links, ScanIndex, choose_lidars, places_of, put_together
+from lslam.io.readers.bag_lidars import NO_NAME, Halves, Links, ScanIndex, choose_lidars, places_of, put_together
 from lslam.io.readers.bag_packets import open_packets
 from lslam.io.readers.bag_topics import (
     GNSS,
@@ -201,7 +201,7 @@ def _lidars_of(bag: Bag, topic: BagTopic, info: SequenceInfo, voice: Voice, has_
     if can_decode(topic):
         turns, frame = open_packets(bag, topic, voice)
         stamps = turns.revolutions.stamps_ns
-        ((name, _),) = choose_lidars(topic, [frame or UNNAMED], info.lidar_frame, voice)
+        ((name, _),) = choose_lidars(topic, [frame or NO_NAME], info.lidar_frame, voice)
         whole = ScanIndex(topic, name, frame, np.arange(len(stamps)), stamps, {})
         sources: list[tuple[ScanIndex, SpinningSensor | None]] = [(whole, turns)]
     else:

@@ -25,13 +25,13 @@ from lslam.io.formats.sensor_messages import decode_livox, decode_pointcloud2
 from lslam.io.readers.ground_truth import Voice
 
 ALL = "all"
-UNNAMED = "unnamed"
+NO_NAME = "unnamed"
 
 _MOST = 40  # parts of a revolution; more messages of one stamp come from a clock that stands still
 _STAMPS_LOOKED_AT = 40  # stamps; of more of them so many are looked at before the recording is read
 _BINS = 90  # of azimuth
 _FULL = 5 / 6  # of all directions, by 12 deg: the sensor turns, and what it sees again is another revolution
-_SHARED = 0.2  # of azimuths or of the time: parts of one revolution meet at their seams
+_MOST_OVERLAP = 0.2  # of azimuths or of the time: parts of one revolution meet at their seams
 
 # Further messages of a scan, by the first of them.
 Halves = Mapping[int, tuple[int, ...]]
@@ -64,7 +64,7 @@ def name_lidars(frames: Sequence[str], ids: Sequence[int | None]) -> list[str]:
     """Name of the sensor of each message: its frame; with Livox's `lidar_id` where one frame has several, `livox:1`."""
     several = {frame for frame, count in Counter(f for f, _ in set(zip(frames, ids, strict=True))).items() if count > 1}
     return [
-        f"{frame or UNNAMED}:{number}" if frame in several else frame or UNNAMED
+        f"{frame or NO_NAME}:{number}" if frame in several else frame or NO_NAME
         for frame, number in zip(frames, ids, strict=True)
     ]
 
@@ -211,7 +211,7 @@ def _shift_times(cloud: PointCloud, later_ns: int) -> PointCloud:
 def _is_complement(a: PointCloud, b: PointCloud) -> bool:
     """Whether b covers other azimuths or rings than a, or, for a sensor that does not turn, other times."""
     of_a, of_b = _azimuths(a), _azimuths(b)
-    if np.minimum(of_a, of_b).sum() <= _SHARED * min(of_a.sum(), of_b.sum()):
+    if np.minimum(of_a, of_b).sum() <= _MOST_OVERLAP * min(of_a.sum(), of_b.sum()):
         return True
     if a.rings is not None and b.rings is not None:
         own = b.rings[b.rings != NO_RING]
@@ -222,7 +222,7 @@ def _is_complement(a: PointCloud, b: PointCloud) -> bool:
         return False
     (a0, _, a1), (b0, _, b1) = _when(a.times), _when(b.times)
     shorter = min(a1 - a0, b1 - b0)
-    return shorter > 0 and min(a1, b1) - max(a0, b0) <= _SHARED * shorter
+    return shorter > 0 and min(a1, b1) - max(a0, b0) <= _MOST_OVERLAP * shorter
 
 
 def _azimuths(cloud: PointCloud) -> Longs:
@@ -338,7 +338,7 @@ def places_of(
         if place is None:
             key, why = other.name, links.why_not(leading.frame, other.frame)
             if is_same:
-                key, why = other.topic.name, f"both are of frame {other.frame or UNNAMED}"
+                key, why = other.topic.name, f"both are of frame {other.frame or NO_NAME}"
             raise InputError(
                 f"{links.bag.path}: {other} cannot be merged with {leading}, {why}: state T_lidar_other, 12 numbers, in "
                 f'sequence.toml, [lidars] "{key}" = [1, 0, 0, x, ...], or take one LiDAR with --lidar-topic or --lidar-frame'

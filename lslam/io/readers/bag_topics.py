@@ -25,7 +25,7 @@ CLOUDS = ("PointCloud2", "CustomMsg")
 HEADER = 512  # bytes of a message that hold its header
 _LATE_NS = 10**9  # stamps that go back further are no jitter, nor by more than so many messages
 _LATE_STEPS = 10
-_CROWDED = 1.5  # times as many messages as the rate makes: they tell of a time that others have told of
+_CROWDED_RATIO = 1.5  # times as many messages as the rate makes: they tell of a time that others have told of
 _APART_NS = 60 * 10**9  # parts of one recording follow each other sooner
 _FEW = 4  # messages that may come late at the seam of two parts
 
@@ -251,7 +251,7 @@ def _told_again(stamps: Stamps, late: Stamps, step: float) -> Bools:
         lo, hi = stamps[begin:end].min(), stamps[begin:end].max()
         there = int(np.searchsorted(ahead, hi, "right") - np.searchsorted(ahead, lo))
         own = int(end - begin)
-        again[begin:end] = 2 <= own <= 2 * there and own + there >= _CROWDED * (float(hi - lo) / step + 1)
+        again[begin:end] = 2 <= own <= 2 * there and own + there >= _CROWDED_RATIO * (float(hi - lo) / step + 1)
     return again
 
 

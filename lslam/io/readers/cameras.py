@@ -25,7 +25,7 @@ from lslam.io.readers.listing import list_scans, rows_of
 
 # ROS' words for the models of `Lens`; a rational polynomial with more coefficients than eight bends its sensor.
 _ROS_MODELS = {"plumb_bob": "pinhole", "rational_polynomial": "pinhole", "equidistant": "fisheye", "fisheye": "fisheye"}
-_PACKED = "/compressed"
+_COMPRESSION_SUFFIX = "/compressed"
 # Stamps of images and times of recording to the offset of their clock from that of the scans, ns.
 Ahead = Callable[[Longs, Longs, str], int]
 
@@ -138,7 +138,7 @@ def bag_cameras(
             f"{bag.path} has no images in {unknown[0]}, which cameras of sequence.toml names: {_list_topics(topics)}"
         )
     for topic in topics.values():
-        if topic.name.endswith(_PACKED) and topic.name.removesuffix(_PACKED) in topics:
+        if topic.name.endswith(_COMPRESSION_SUFFIX) and topic.name.removesuffix(_COMPRESSION_SUFFIX) in topics:
             continue
         if named and topic.name not in named:
             continue
@@ -183,7 +183,7 @@ def _bag_camera(
 
 def _bag_lens(bag: Bag, topic: BagTopic) -> Lens:
     """The lens by the CameraInfo beside the images. Raises InputError where there is none, or one that is not filled in."""
-    image = topic.name.removesuffix(_PACKED)
+    image = topic.name.removesuffix(_COMPRESSION_SUFFIX)
     beside = (f"{image.rpartition('/')[0]}/camera_info", f"{image}/camera_info")
     infos = [t for t in bag.of_type("CameraInfo") if t.name in beside]
     if not infos:

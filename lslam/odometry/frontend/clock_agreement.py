@@ -41,7 +41,7 @@ _NEIGHBOURS, _RADIUS_M, _FEWEST = 16, 1.0, 6
 # m; distances from a surface count by d^2 / (d^2 + _SCALE_M^2): thickness counts, what is no surface does not.
 _SCALE_M = 0.05
 # The score where nothing is to compare.
-_LOST = 1.0
+_WORST_SCORE = 1.0
 # A window that moves by less in a sweep, m and rad, decides nothing.
 STILL_M, STILL_RAD = 0.03, float(np.deg2rad(0.4))
 # Student's t of paired differences, the share of scans with the same sign and the relative difference of a clear decision.
@@ -133,12 +133,12 @@ class ClockWindow:
             at_poses = self._place(clock, config, motion)[SKIPPED - 1 :]
             is_judged = self._is_same_motion(at_poses)
             # Rings on flat ground agree best with themselves where the motion is lost: that is no evidence.
-            self._scores[clock] = _distances(at_poses)[1:] if is_judged else np.full(len(at_poses) - 1, _LOST)
+            self._scores[clock] = _distances(at_poses)[1:] if is_judged else np.full(len(at_poses) - 1, _WORST_SCORE)
         return self._scores[clock]
 
     def is_astray(self, clock: SweepClock | None) -> bool:
         """Whether odometry found another motion under the clock than the window has, so that its scores say nothing."""
-        return bool((self.scores(clock) >= _LOST).all())
+        return bool((self.scores(clock) >= _WORST_SCORE).all())
 
     def _place(self, clock: SweepClock | None, config: Config, motion: ConstantVelocity | None) -> list[_ScanAtPose]:
         """The scans where odometry has them under the clock."""
@@ -228,7 +228,7 @@ def _distance(tree: Any, cloud: Floats, owner: Longs, number: int, points: Float
     count = weight.sum(axis=1)
     is_usable = count >= _FEWEST
     if not is_usable.any():
-        return _LOST
+        return _WORST_SCORE
     points, near, weight, count = points[is_usable], near[is_usable], weight[is_usable], count[is_usable, None]
     neighbours = cloud[near]
     middle = np.einsum("nk,nki->ni", weight, neighbours) / count

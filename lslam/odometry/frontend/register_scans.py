@@ -36,7 +36,7 @@ from lslam.registration.acceptance import PRIOR_COVARIANCE
 from lslam.registration.local_map import surroundings_m
 
 # Of a pose in a frame of which nobody knows where it lies, m2 and rad2.
-UNBOUNDED = np.diag(np.full(6, np.inf))
+INFINITE_COVARIANCE = np.diag(np.full(6, np.inf))
 # Scans with points that say when sweeps begin and end.
 _LOOKED_AT = 3
 
@@ -155,7 +155,7 @@ def between_middles(result: ScanResult, middle: tuple[int, Floats], following: T
 def to_trajectory(results: list[ScanResult], method: str) -> Trajectory:
     """The poses of all scans, with covariances when the method has them.
 
-    A skipped scan adds `PRIOR_COVARIANCE` to the last; that of a scan in another frame is `UNBOUNDED`.
+    A skipped scan adds `PRIOR_COVARIANCE` to the last; that of a scan in another frame is `INFINITE_COVARIANCE`.
     """
     has_covariances = any(r.covariance is not None for r in results)
     covariances: list[Floats] = []
@@ -164,7 +164,7 @@ def to_trajectory(results: list[ScanResult], method: str) -> Trajectory:
         covariances.append(before + PRIOR_COVARIANCE if result.covariance is None else result.covariance)
     elsewhere = [k for k, result in enumerate(results) if result.frame and has_covariances]
     for k in elsewhere:
-        covariances[k] = UNBOUNDED
+        covariances[k] = INFINITE_COVARIANCE
     return Trajectory(
         stamps_ns=np.array([r.stamp_ns for r in results], np.int64),
         poses=np.stack([r.at_stamp.T_world_lidar for r in results]),

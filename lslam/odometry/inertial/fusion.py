@@ -37,7 +37,7 @@ class InertialMotion(Stateful):
     """
 
     # One scan in so many is registered from constant velocity too, to tell what the IMU saves.
-    COMPARED = 20
+    COMPARISON_INTERVAL_SCANS = 20
     # Whether it has states for the device, the rotation of its extrinsics and its clock.
     HAS_DEVICE: ClassVar[bool] = True
     STATE: ClassVar[tuple[str, ...]] = (
@@ -92,7 +92,10 @@ class InertialMotion(Stateful):
 
         Where constant velocity predicts it anyway, over a gap of the IMU, there is nothing to compare.
         """
-        is_due = self.coasting.is_known and self._scans % self.COMPARED == self.COMPARED - 1
+        is_due = (
+            self.coasting.is_known
+            and self._scans % self.COMPARISON_INTERVAL_SCANS == self.COMPARISON_INTERVAL_SCANS - 1
+        )
         return is_due and self._feels(stamp_ns, span)
 
     def sweep(self, stamp_ns: int, span: Span) -> MotionPrior:

@@ -28,7 +28,7 @@ from lslam.pipeline.run_folder import KEYFRAMES
 from lslam.reports.page_data import judgement, pair_data
 
 EDITS, POINTS = "edits.csv", "points.csv"
-SHOWN = 12_000  # points of a scan's surroundings on the page, at most
+MOST_POINTS = 12_000  # points of a scan's surroundings on the page, at most
 
 
 class Pair(BaseModel):
@@ -159,7 +159,7 @@ class Corrections:
             at = {result.stamp_ns: k for k, result in enumerate(self._results)}
             scans = [at[store.keyframes[k].stamp_ns] for k in (known.a, known.b)]
             T = self.run.trajectory.poses[scans[0]]
-            view = view_pair(store, candidate, T, size, SHOWN)
+            view = view_pair(store, candidate, T, size, MOST_POINTS)
         return {**pair_data(view), "scans": [self._results[k].index for k in scans], **judgement(candidate)}
 
     def _before(self, name: str, other: str) -> Path | None:

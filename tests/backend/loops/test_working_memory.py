@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from lslam.backend.loops import PlaceMatch
 from lslam.backend.loops.detector import NEAR_M, Detector
-from lslam.backend.loops.gating import LOOP_PLACES, RETRIEVED, WorkingMemory
+from lslam.backend.loops.gating import LOOP_PLACES, MOST_RETRIEVALS, WorkingMemory
 from lslam.core.config.backend import LoopsConfig
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.types.constraint import LoopCandidate, LoopStage, Verdict
@@ -61,7 +61,7 @@ def test_a_loop_retrieves_the_neighbours_of_its_older_place_nearest_first() -> N
         )
     for k in range(203, 240):
         memory.reach(k)
-        assert len(memory) <= 20 + 2 * LOOP_PLACES + RETRIEVED
+        assert len(memory) <= 20 + 2 * LOOP_PLACES + MOST_RETRIEVALS
     retrieved = np.intersect1d(memory.before(200), np.arange(100))
     np.testing.assert_array_equal(retrieved, np.setdiff1d(np.arange(50 - LOOP_PLACES, 51 + LOOP_PLACES), [50]))
 
@@ -132,7 +132,7 @@ def test_laps_are_closed_with_places_in_memory_and_threads_change_nothing(monkey
     closures = [c for c in alone if c.is_accepted]
     assert all(any(lap * 72 < c.b <= (lap + 1) * 72 for c in closures) for lap in (1, 2, 3))
     assert {c.a // 72 for c in closures if c.b > 216} & {1, 2}
-    assert len(detector.memory) <= 80 + 2 * LOOP_PLACES + RETRIEVED
+    assert len(detector.memory) <= 80 + 2 * LOOP_PLACES + MOST_RETRIEVALS
     assert sum(c.is_accepted for c in detect(monkeypatch, "all", 80, 4.2)[0]) <= 1.2 * len(closures)
 
 
