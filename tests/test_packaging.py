@@ -189,7 +189,7 @@ def test_the_install_command_names_what_is_installed(
             assert name == "direct_url.json"
             return json.dumps(source) if source else None
 
-    monkeypatch.setattr("lslam.core.extras.distribution", lambda name: Installed())
+    monkeypatch.setattr("importlib.metadata.distribution", lambda name: Installed())
     pip, install, requirement = shlex.split(install_command("geo"))
     assert (pip, install, requirement) == ("pip", "install", said)
     # As pip reads it.
