@@ -192,7 +192,7 @@ def test_runs_without_an_error_decide_nothing_about_errors(kind: str) -> None:
     case = CASES[kind]
     none = by_seed(case.right, lambda v, s: {"thesis_rmse": nan})
     found = case.judged(kind, none)
-    assert (found.outcome, "no run has an error" in found.measured) == ("undecided", True)
+    assert (found.outcome, "no run has an error" in found.numbers) == ("undecided", True)
     half_lost = by_seed(none, lambda v, s: {"status": "diverged"} if v > 7 else {})
     assert case.judged(kind, half_lost).outcome == "undecided"
 
@@ -212,7 +212,7 @@ def test_words_are_no_places_on_an_axis(kind: str, values: list[float]) -> None:
     words = rows_of(["a", "b", "c", "d", "e", "f", "g"], "preprocess.downsample", error=lambda v: 0.5, noise=0.02)
     found = verdict(words, kind, *values)
     assert found.outcome == "undecided"
-    assert found.measured == "preprocess.downsample is not a number"
+    assert found.numbers == "preprocess.downsample is not a number"
     assert outcome(words, "matters_little", 1.5, of="translation") == "confirmed"
 
 
@@ -220,7 +220,7 @@ def test_times_of_runs_that_shared_the_machine_decide_nothing() -> None:
     rows = rows_of(SKIPS, total=lambda v: 46.82 / v, noise=0.02, is_timing_comparable=False)
     found = verdict(rows, "inverse")
     assert found.outcome == "undecided"
-    assert "shared the machine" in found.measured
+    assert "shared the machine" in found.numbers
     assert outcome(rows, "matters_little", 1.5, of="translation") == "confirmed"
     flat = rows_of(SKIPS, is_timing_comparable=False)
     assert outcome(flat, "matters_little", 1.5, of="total_time") == "undecided"
@@ -258,13 +258,13 @@ def test_what_the_imu_does_asks_for_the_same_runs_without_it() -> None:
     rows = both(lambda v: 0.3, lambda v: 0.5)
     for other in (rows[:30] + rows[60:], [replace(row, seed=row.seed + row.uses_imu) for row in rows], rows[60:]):
         found = verdict(other, "imu_lowers", of="translation")
-        assert (found.outcome, found.measured) == ("undecided", "the same was not run without the IMU")
+        assert (found.outcome, found.numbers) == ("undecided", "the same was not run without the IMU")
     shared = [replace(row, is_timing_comparable=False) for row in rows]
-    assert "shared the machine" in verdict(shared, "imu_lowers", of="time_per_scan").measured
+    assert "shared the machine" in verdict(shared, "imu_lowers", of="time_per_scan").numbers
 
 
 def test_a_trend_says_by_how_much() -> None:
-    assert verdict(RISING, "rises", of="translation").measured.startswith("translation of the upper half")
+    assert verdict(RISING, "rises", of="translation").numbers.startswith("translation of the upper half")
     few = [row for row in RISING if row.parameters["input.skip_frames"] in (1, 20)]
     assert verdict(few, "rises", of="translation").outcome == "undecided"
     lost = by_seed(FALLING, lambda v, s: {"status": "diverged"} if v > 10 else {})

@@ -17,7 +17,7 @@ def test_little_influence() -> None:
     assert outcome(rows_of(SKIPS, error=lambda v: 0.1 * v), "matters_little", 1.5, of="translation") == "refuted"
     lost = verdict(rows_of(SKIPS, diverges=lambda v: v == 5), "matters_little", 1.5, of="translation")
     assert lost.outcome == "refuted"
-    assert "diverges at 5" in lost.measured
+    assert "diverges at 5" in lost.numbers
     assert outcome(rows_of([1, 2]), "matters_little", 1.5) == "undecided"
 
 
@@ -29,7 +29,7 @@ def test_laws() -> None:
     assert outcome(line, "inverse") == "refuted"
     assert outcome(line, "linear") == "confirmed"
     assert outcome(hyperbola[:15], "inverse") == "undecided"
-    assert "R2 1.000" in verdict(rows_of(SKIPS, total=lambda v: 46.82 / v), "inverse", 0.99).measured
+    assert "R2 1.000" in verdict(rows_of(SKIPS, total=lambda v: 46.82 / v), "inverse", 0.99).numbers
 
 
 def test_product_law() -> None:
@@ -53,16 +53,16 @@ def test_stage_that_a_parameter_acts_on() -> None:
     assert outcome(rows_of(GRID, "loam.grid_step"), "acts_only_on", stages=["register"]) == "undecided"
     hardly = rows_of(GRID, "loam.grid_step", stages=lambda v: {"scan": 50 + v, "map": 20.0})
     assert outcome(hardly, "acts_only_on", stages=["scan"]) == "undecided"
-    assert "no stage maps was timed" in verdict(on_scan, "acts_only_on", stages=["maps"]).measured
+    assert "no stage maps was timed" in verdict(on_scan, "acts_only_on", stages=["maps"]).numbers
 
 
 def test_little_influence_is_not_stated_of_values_without_result_or_of_a_key_without_effect() -> None:
     rows = rows_of(SKIPS, error=lambda v: 0.5 + 0.005 * v)
     gone = [replace(r, status="crashed") if r.parameters["input.skip_frames"] > 15 else r for r in rows]
     found = verdict(gone, "matters_little", 1.5, of="translation")
-    assert (found.outcome, "nothing is known at 16, 17" in found.measured) == ("undecided", True)
+    assert (found.outcome, "nothing is known at 16, 17" in found.numbers) == ("undecided", True)
     same = verdict(rows_of(SKIPS), "matters_little", 1.5, of="translation")
-    assert (same.outcome, "the parameter was not in use" in same.measured) == ("undecided", True)
+    assert (same.outcome, "the parameter was not in use" in same.numbers) == ("undecided", True)
     seeds = by_seed(rows_of(SKIPS), lambda v, s: {"thesis_rmse": 0.5 + s})
     assert outcome(seeds, "matters_little", 1.5, of="translation") == "undecided", "seeds differ, values do not"
     first = by_seed(rows_of(SKIPS), lambda v, s: {"thesis_rmse": 0.5 + 0.001 * v * (s > 0)})
@@ -84,14 +84,14 @@ def test_laws_that_cannot_be_told_apart_are_undecided() -> None:
     assert outcome(narrow, "inverse") == "confirmed"
     found = verdict(narrow, "linear")
     assert found.outcome == "undecided"
-    assert "but a / x fits as well" in found.measured
+    assert "but a / x fits as well" in found.numbers
 
 
 def test_a_product_needs_both_parameters_to_vary() -> None:
     rows = rows_of(SKIPS, total=lambda v: 50 / v, at={"preprocess.random_share": 0.5})
     found = verdict(rows, "product")
     assert found.outcome == "undecided"
-    assert "but a / x fits as well" in found.measured
+    assert "but a / x fits as well" in found.numbers
 
 
 def test_a_misfit_of_unknown_scatter_refutes_no_law() -> None:
@@ -106,7 +106,7 @@ def test_a_stage_that_some_values_do_without_counts_as_no_time() -> None:
     )
     found = verdict(rows, "acts_only_on", stages=["scan"])
     assert found.outcome == "refuted"
-    assert "recover by 40" in found.measured
+    assert "recover by 40" in found.numbers
 
 
 def test_stages_of_two_values_are_too_few() -> None:

@@ -29,7 +29,7 @@ def test_divergence() -> None:
     assert outcome(at_8, "diverges_beyond", 9) == "refuted"
     assert outcome(rows_of(SKIPS), "diverges_beyond", 7) == "refuted"
     assert outcome(rows_of(range(1, 7)), "diverges_beyond", 7) == "undecided"
-    assert "everything diverges" in verdict(rows_of(SKIPS, diverges=lambda v: True), "diverges_beyond", 7).measured
+    assert "everything diverges" in verdict(rows_of(SKIPS, diverges=lambda v: True), "diverges_beyond", 7).numbers
 
 
 def test_holding_up() -> None:
@@ -41,28 +41,28 @@ def test_holding_up() -> None:
     assert outcome(rows_of(SKIPS, diverges=lambda v: True), "holds_up_to", 0.5) == "undecided", "nothing holds"
     once = verdict(rows_of(SKIPS, diverges=lambda v: v == 5), "holds_up_to", 20)
     assert once.outcome == "undecided"
-    assert once.measured == "nothing diverges for good, though 3 of 3 runs at 5 are lost"
+    assert once.numbers == "nothing diverges for good, though 3 of 3 runs at 5 are lost"
 
 
 def test_runs_lost_where_most_seeds_succeed_are_counted() -> None:
     rows = rows_of(SKIPS)
     one = [replace(r, status="diverged") if r.seed == 1 and r.parameters["input.skip_frames"] > 18 else r for r in rows]
     at_20 = verdict(one, "holds_up_to", 20)
-    assert (at_20.outcome, at_20.measured) == ("confirmed", "it holds up to 20, though 2 of 6 runs at 19, 20 are lost")
-    assert verdict(one, "holds_up_to", 18).measured == "nothing diverges up to 18"
-    beyond = verdict(one, "diverges_beyond", 7).measured
+    assert (at_20.outcome, at_20.numbers) == ("confirmed", "it holds up to 20, though 2 of 6 runs at 19, 20 are lost")
+    assert verdict(one, "holds_up_to", 18).numbers == "nothing diverges up to 18"
+    beyond = verdict(one, "diverges_beyond", 7).numbers
     assert beyond == "it holds up to 20, the largest value, though 2 of 6 runs at 19, 20 are lost"
     rows = rows_of(SKIPS, diverges=lambda v: v > 12)
     some = [
         replace(r, status="diverged") if r.seed == 2 and r.parameters["input.skip_frames"] == 9 else r for r in rows
     ]
     assert (
-        verdict(some, "diverges_beyond", 7).measured
+        verdict(some, "diverges_beyond", 7).numbers
         == "12 is the last value that works, though 1 of 3 runs at 9 is lost"
     )
-    assert verdict(some, "holds_up_to", 20).measured == "it diverges from 13 on, though 1 of 3 runs at 9 is lost"
+    assert verdict(some, "holds_up_to", 20).numbers == "it diverges from 13 on, though 1 of 3 runs at 9 is lost"
     none = rows_of(SKIPS, diverges=lambda v: True)
-    assert verdict(none, "holds_up_to", 20).measured == "it diverges from 1 on"
+    assert verdict(none, "holds_up_to", 20).numbers == "it diverges from 1 on"
 
 
 @pytest.mark.parametrize("kind", ["diverges_beyond", "holds_up_to", "good_from"])
@@ -77,7 +77,7 @@ def test_value_whose_runs_all_failed_or_have_no_error_is_not_one_that_was_run(
     rows = [replace(r, **failed) if r.parameters["input.skip_frames"] > 12 else r for r in rows_of(SKIPS)]
     found = verdict(rows, kind, 13)
     assert found.outcome == "undecided"
-    assert "12" in found.measured
+    assert "12" in found.numbers
 
 
 def test_best_value() -> None:
@@ -107,8 +107,8 @@ def test_best_value_that_is_best_in_few_seeds_is_not_confirmed(first: float, agr
     ]
     found = verdict(rows, "best_between", 1, 2)
     assert found.outcome == "undecided"
-    assert "best at 1.5" in found.measured
-    assert f"in {agree} of 3 seeds only" in found.measured
+    assert "best at 1.5" in found.numbers
+    assert f"in {agree} of 3 seeds only" in found.numbers
 
 
 def test_best_value_is_not_where_most_runs_are_lost() -> None:
@@ -151,7 +151,7 @@ def test_elbow() -> None:
     at_15 = rows_of(DISTANCES, "imu.inlier_distance", error=lambda v: 0.5 if v >= 1 else 1.9, noise=0.02)
     assert outcome(at_15, "elbow_at", 0.7) == "undecided", "a step beside it, on the other side"
     later = verdict(at_15, "elbow_at", 0.5)
-    assert (later.outcome, "below" in later.measured) == ("refuted", False)
+    assert (later.outcome, "below" in later.numbers) == ("refuted", False)
     assert outcome(at_15, "elbow_at", 100) == "undecided", "no value is taken for the nearest that was run"
     flat = rows_of(DISTANCES, "imu.inlier_distance")
     assert outcome(flat, "elbow_at", 0.2) == "refuted"
@@ -172,7 +172,7 @@ def test_a_bound_needs_values_below_it_that_are_worse() -> None:
     """That errors rise only below a share of 0.2 is not shown by a plateau that begins at the smallest value run."""
     flat = rows_of(DISTANCES, "imu.inlier_distance", noise=0.02)
     found = verdict(flat, "good_from", 0.3)
-    assert (found.outcome, "below 0.3 it is as good" in found.measured) == ("refuted", True)
+    assert (found.outcome, "below 0.3 it is as good" in found.numbers) == ("refuted", True)
     assert outcome(flat, "good_from", 0.1) == "undecided", "nothing was run below"
     rises = rows_of(DISTANCES, "imu.inlier_distance", error=lambda v: 0.5 if v >= 0.3 else 0.7, noise=0.02)
     assert outcome(rises, "good_from", 0.3) == "confirmed"
@@ -202,11 +202,11 @@ def test_a_range_whose_runs_are_all_lost_is_not_the_best_one() -> None:
 def test_a_flat_curve_has_no_best_range() -> None:
     flat = verdict(rows_of(GRID, "loam.grid_step", noise=0.01), "best_between", 1, 2, of="translation")
     assert flat.outcome == "refuted"
-    assert "all values outside are as good" in flat.measured
+    assert "all values outside are as good" in flat.numbers
     half = rows_of(GRID, "loam.grid_step", error=lambda v: 1.0 if v < 1 else 0.5 + 0.001 * v, noise=0.001)
     found = verdict(half, "best_between", 1, 2, of="translation")
     assert found.outcome == "undecided"
-    assert "on one side no value is worse" in found.measured
+    assert "on one side no value is worse" in found.numbers
 
 
 def test_a_plateau_that_one_seed_leaves_decides_nothing() -> None:
@@ -223,4 +223,4 @@ def test_a_value_outside_that_seeds_call_better_but_their_median_does_not_leaves
     )
     found = verdict(rows, "best_between", 1, 2, of="translation")
     assert found.outcome == "undecided"
-    assert found.measured.startswith("translation is best at 1 ")
+    assert found.numbers.startswith("translation is best at 1 ")

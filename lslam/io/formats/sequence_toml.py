@@ -189,7 +189,7 @@ def parse_sequence_toml(text: str, path: Path | str) -> SequenceInfo:
         if key not in _KEYS:
             raise InputError(f"{path}: unknown key {key!r}; {nearest(key, [*_KEYS, *_TABLES])}")
         if not _KEYS[key]["is_valid"](value):
-            raise InputError(f"{path}: {key} = {value!r}, expected {_KEYS[key]['form']}")
+            raise InputError(f"{path}: {key} = {value!r}, expected {_KEYS[key]['expected']}")
         values[key] = float(value) if key in ("rate_hz", "vertical_correction_deg") else value
     for key, value in tables["extrinsics"].items():
         if key not in EXTRINSICS:
