@@ -230,8 +230,9 @@ def file_setting(path: str | Path | None) -> str | None:
 
 
 def crs_settings(given: dict[str, Any]) -> dict[str, Any]:
-    """Values of the options of `coordinates` by configuration key. Raises UsageError for an invalid code."""
-    crs = output_crs(given)
+    """Values of the options of `coordinates` by configuration key; a number alone is a code. Raises UsageError for none."""
+    code = given["crs"]
+    crs = output_crs({**given, "crs": f"EPSG:{code}" if code and code[0].isdecimal() else code})
     if crs is None:
         return {}
     return {"gnss.crs": crs.epsg, "gnss.height_crs": crs.height_epsg, "gnss.geoid": quote(crs.geoid or None)}
@@ -244,7 +245,7 @@ def output_crs(given: dict[str, Any]) -> OutputCrs | None:
         return None
     from lslam.core.geometry.geodesy import parse_crs
 
-    epsg, height_epsg = (None, None) if crs is None else parse_crs(f"EPSG:{crs}" if crs[:1].isdecimal() else crs)
+    epsg, height_epsg = (None, None) if crs is None else parse_crs(crs)
     grid = Path(geoid).expanduser()
     if geoid and grid.exists():  # other names are those of PROJ's own grids
         geoid = str(grid.absolute())

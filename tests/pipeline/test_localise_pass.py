@@ -64,7 +64,7 @@ def test_an_interrupted_localisation_goes_on_to_the_same_bytes(
     seen = [0]
 
     def look() -> bool:
-        seen[0] += sys._getframe(1).f_code.co_name == "_followed"
+        seen[0] += sys._getframe(1).f_code.co_name == "_follow"
         return seen[0] > scan
 
     with pytest.raises(InterruptedRunError, match="localisation"):
@@ -115,7 +115,7 @@ def test_a_map_that_is_another_by_then_is_searched_anew(map_run: Path, whole: Pa
     seen = [0]
 
     def look() -> bool:
-        seen[0] += sys._getframe(1).f_code.co_name == "_followed"
+        seen[0] += sys._getframe(1).f_code.co_name == "_follow"
         return seen[0] > 10
 
     with pytest.raises(InterruptedRunError):
@@ -133,7 +133,7 @@ def test_poses_are_those_of_the_run_that_made_the_map(map_run: Path, whole: Path
 
 
 def test_a_drive_that_the_map_does_not_know_fails_with_the_way_out(map_run: Path, tmp_path: Path) -> None:
-    wrong = config(map_run, "localize.start=[60.0, 60.0, 0.0]", "localize.start_radius=4", "localize.start_turn_deg=5")
+    wrong = config(map_run, "localize.start=[0.0, 0.0, 90.0]", "localize.start_radius=4", "localize.start_turn_deg=5")
     with pytest.raises(RunFailedError, match="--start X,Y,HEADING"):
         lslam.run(SAMPLE, wrong, out=tmp_path / "out")
 

@@ -61,7 +61,7 @@ def counted(log, total):
     print(len(ready), total)
     del jit._when_ready[:]
 
-jit.counted = counted
+jit.count_kernels = counted
 from lslam.core.config import load_config
 from lslam.pipeline.run import run
 run(sys.argv[1], load_config(settings=["input.count=2", "loops.use=false"]))
