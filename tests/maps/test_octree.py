@@ -128,7 +128,7 @@ def test_memory_does_not_grow_with_the_map(tmp_path: Path) -> None:
     for blocks in (4, 16):
         tracemalloc.start()
         with (tmp_path / "nodes").open("wb") as stream:
-            tree = write_octree(stream, tmp_path, Endless(blocks), (0, 1), held=1 << 15)
+            tree = write_octree(stream, tmp_path, Endless(blocks), (0, 1), most_points=1 << 15)
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
         assert tree["points"] == blocks << 16
