@@ -134,11 +134,11 @@ def test_it_does_nothing_without_an_imu() -> None:
 def test_warming_up_compiles_what_the_window_is_solved_with(monkeypatch: pytest.MonkeyPatch) -> None:
     sequence = replace(walk(), scans=walk().scans[:8])
     one, method, _ = tracker_of(sequence, windowed())
-    calls = recorded(monkeypatch, linalg, "inverse", "complement", "solved")
+    calls = recorded(monkeypatch, linalg, "inverse", "complement", "solve")
     method.warm_up()
     warm = set(calls)
     assert len(method.registration.map) == 0
     for loaded in read_ahead(sequence, method.prepare, 1):
         one.track(loaded)
-    assert {name for name, _ in calls} == {"inverse", "complement", "solved"}
+    assert {name for name, _ in calls} == {"inverse", "complement", "solve"}
     assert calls == warm

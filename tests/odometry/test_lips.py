@@ -119,10 +119,10 @@ def test_planes_are_registered_over_a_gap_and_a_lost_scan() -> None:
 
 def test_warming_up_compiles_what_the_window_is_solved_with(monkeypatch: pytest.MonkeyPatch) -> None:
     one = tracker()
-    calls = recorded(monkeypatch, linalg, "inverse", "complement", "solved")
+    calls = recorded(monkeypatch, linalg, "inverse", "complement", "solve")
     one.odometry.warm_up()
     warm = set(calls)
-    assert {name for name, _ in warm} == {"inverse", "complement", "solved"}
+    assert {name for name, _ in warm} == {"inverse", "complement", "solve"}
     for loaded in read_ahead(replace(walk(), scans=walk().scans[:3]), one.odometry.prepare, 1):
         one.track(loaded)
     assert calls == warm
@@ -172,7 +172,7 @@ def test_the_scan_after_a_rejected_one_is_linked_to_its_smoothed_pose() -> None:
     assert after.link is not None
     assert after.link.step is not None
     assert after.link.step.seconds == 0.0
-    led = one.odometry._predicted(after.link).T_world_lidar @ se3.inverse(after.link.within)
+    led = one.odometry._predict(after.link).T_world_lidar @ se3.inverse(after.link.within)
     assert np.linalg.norm(led[:3, 3] - after.pose[:3, 3]) < 0.05
 
 

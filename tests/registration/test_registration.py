@@ -20,6 +20,7 @@ from lslam.core.config.input import PreprocessConfig
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.errors import InputError
 from lslam.core.geometry import se3, so3
+from lslam.registration.gaussian_map import COUNT_CAP
 from lslam.registration.optimiser import KERNEL_MIN_M
 from lslam.registration.preprocessing.prepare import PreparedPoints
 from lslam.registration.registration import Registration
@@ -176,7 +177,7 @@ def test_a_static_sensor_neither_drifts_nor_becomes_overconfident() -> None:
     # As sure in the end as when the map had filled, not two hundred scans surer; a millimetre here.
     assert (spread[-1] > 0.4 * spread[20]).all()
     assert (np.array(spread)[1:, :3] > 2e-4).all()
-    assert registration.map.fine.moments[:, 0].max() < 1.1 * registration.config.count_cap
+    assert registration.map.fine.moments[:, 0].max() < 1.1 * COUNT_CAP
 
 
 def digest(seed: int = 3) -> str:
