@@ -251,6 +251,5 @@ def test_the_sample_raises_no_alert_with_features() -> None:
 def test_recordings_raise_no_alert(recordings: Callable[[str], Path], name: str) -> None:
     folder = recordings(name)
     drive_folder = folder / "2011_09_26" / f"2011_09_26_drive_{name[-4:]}_sync" if "kitti" in name else folder / name
-    # What a run finds out by itself of its clock: tests/pipeline/test_point_times.py.
-    outcome = ended(select(open_sequence(drive_folder, point_times=None if "kitti" in name else "columns"), 0, 100))
+    outcome = ended(select(open_sequence(drive_folder), 0, 100))
     assert problems(outcome) == []

@@ -48,8 +48,7 @@ def walked(in_the_middle: bool, seed: int = 0) -> Sequence:
 
 def poses_of(sequence: Sequence, method: str, use_imu: bool) -> Floats:
     settings = [f"odometry.method={method}", "loops.use=false", "map.write=false"]
-    # A walker's first step needs no search.
-    settings += [f"imu.use={str(use_imu).lower()}", "imu.start_s=1", "recovery.start_search=false"]
+    settings += [f"imu.use={str(use_imu).lower()}", "imu.start_s=1"]
     results = run(sequence, load_config(None, settings, {})).record.results
     assert all(r.status == "ok" for r in results)
     return np.stack([r.T_world_lidar for r in results])
