@@ -48,7 +48,7 @@ def cloud() -> ArrayCloud:
 
 @pytest.mark.parametrize("held", [1 << 22, 20_000])
 def test_every_point_is_in_one_node_and_in_its_cube(cloud: ArrayCloud, tmp_path: Path, held: int) -> None:
-    tree, data = made(cloud, tmp_path, held=held)
+    tree, data = made(cloud, tmp_path, most_points=held)
     assert tree["points"] == len(cloud) == sum(count for _, count in tree["nodes"].values())
     assert not list(tmp_path.iterdir()), "what does not fit into memory is gone again"
     seen = np.zeros(len(cloud), int)
@@ -94,7 +94,7 @@ def test_the_same_bytes_again_and_with_little_memory(cloud: ArrayCloud, tmp_path
     whole = made(cloud, tmp_path)
     assert made(cloud, tmp_path) == whole
     # Points that do not fit into memory come out in the same nodes and order.
-    assert made(cloud, tmp_path, held=1000) == whole
+    assert made(cloud, tmp_path, most_points=1000) == whole
 
 
 def test_what_is_not_finite_is_left_out_and_nothing_is_a_tree_too(tmp_path: Path) -> None:

@@ -41,7 +41,7 @@ def test_rays_feel_it() -> None:
     found = shaking(Vibration(angle_deg=1.0, height_mm=40.0), np.random.default_rng(2))
     assert found is not None
     poses = found.shake(np.eye(4), np.arange(360) * 0.1 / 360)
-    scan = trace(RayScene(builder.build()), model, poses, np.random.default_rng(0), compensated=True)
+    scan = trace(RayScene(builder.build()), model, poses, np.random.default_rng(0), has_one_instant=True)
     assert scan.times is None
     column = np.tile(np.arange(360), 3)
     carried = np.stack([se3.apply(T, p) for T, p in zip(poses[column], scan.points.astype(float), strict=True)])
