@@ -99,6 +99,7 @@ def _sweep(word: str, given: dict[str, Any]) -> Sweep:
     output = options.output_of(given, study.name)
     if not given["dry_run"]:
         require_free(output, STUDY)
+    from lslam.studies.study_runs import Sweep
 
     return Sweep(study, output, given["settings"])
 

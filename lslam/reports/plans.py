@@ -10,7 +10,7 @@ import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,13 +18,8 @@ from numpy.typing import NDArray
 from lslam.core.types.arrays import Floats
 from lslam.io.formats.atomic import atomic_write
 from lslam.reports.picture import COLOURS, house_style, picture
-from lslam.simulation.plan import COARSE, FINE, PATH
+from lslam.simulation.plan import COARSE, FINE, PATH, ScenePlan
 from lslam.simulation.plan import COLOURS as SURFACE_COLOURS
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from lslam.simulation.plan import ScenePlan
 
 _MM = 1 / 25.4  # inch
 _PAGE, _MARGIN = (210.0, 297.0), 15.0  # mm

@@ -83,7 +83,9 @@ def test_loops_that_an_earlier_run_found_are_not_sought_again(tmp_path: Path, mo
     def loops(store: KeyframeStore, kept: Checkpoints | None) -> list[LoopCandidate]:
         watch = SimpleNamespace(should_stop=lambda: False)
         manual = SimpleNamespace(points=())
-        job: Any = SimpleNamespace(store=store, config=config(), kept=lambda _: kept, watch=watch, manual=manual)
+        job: Any = SimpleNamespace(
+            store=store, config=config(), checkpoints_of=lambda _: kept, watch=watch, manual=manual
+        )
         return back_end_pass._loops(job, results, KeyframePairs([], []), KeyframeClocks())[0]
 
     first = loops(store, kept)

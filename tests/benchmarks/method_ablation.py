@@ -121,7 +121,7 @@ ABLATIONS = {
     "ct-icp": Ablation(
         ("ct-icp",), ("walk", "urban", "residential"),
         {
-            "skew": ((LastSweep, "constraints", without(skew=np.zeros(6), skewed=1e12 * np.eye(6))),),
+            "skew": ((LastSweep, "constraints", without(skew=np.zeros(6), skew_information=1e12 * np.eye(6))),),
             "location": ((LastSweep, "constraints", without(location=NOTHING, since=0.0)),),
             "velocity": ((LastSweep, "constraints", without(velocity=NOTHING)),),
             "both": ((LastSweep, "constraints", without(location=NOTHING, since=0.0, velocity=NOTHING)),),

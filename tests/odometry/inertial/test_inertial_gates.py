@@ -17,7 +17,7 @@ from lslam.odometry.inertial.imu_cleaning import ImuRefusedError, clean
 from lslam.odometry.inertial.imu_estimate import ImuEstimate
 from lslam.odometry.inertial.initialise import _is_stationary, _path_of_force
 from lslam.odometry.kernels import kalman
-from lslam.pipeline.doctor import Finding
+from lslam.pipeline.doctor import Findings
 from lslam.pipeline.doctor.examine_imu import examine_imu
 
 Floats = NDArray[np.float64]
@@ -52,7 +52,7 @@ def test_the_least_rate_tolerates_a_slow_clock(rate_hz: float, is_refused: bool)
     stamps = np.round(np.arange(120) * 1e9 / rate_hz).astype(np.int64)
     shaken = np.random.default_rng(0).normal(0, 0.01, (2, 120, 3))
     imu = ImuStream(stamps, np.array([0.0, 0.0, 9.8]) + shaken[0], shaken[1])
-    sequence, findings = Stub(["no scan"] * 20, imu=imu), list[Finding]()
+    sequence, findings = Stub(["no scan"] * 20, imu=imu), Findings()
     if is_refused:
         with pytest.raises(InputError, match=r"an IMU of 50 Hz or more, this one has (47|10)\.0 Hz"):
             _require_rate(sequence, imu, "fast-lio2")
