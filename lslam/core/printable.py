@@ -99,7 +99,7 @@ def count_of(number: int, noun: str) -> str:
 def first_of(names: Sequence[object]) -> str:
     """The first of many, with commas between them.
 
-    >>> shown([1, 2]), shown(range(20))
+    >>> first_of([1, 2]), first_of(range(20))
     ('1, 2', '0, 1, 2, 3, 4, 5, 6, 7 and 12 more')
     """
     return ", ".join(map(str, names[:_MOST_NAMES])) + (

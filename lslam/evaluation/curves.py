@@ -33,7 +33,7 @@ def t_half_width(level: float, freedom: ArrayLike) -> Floats:
 
     As `scipy.stats.t.ppf`, whose import takes longer than the rest of a study's evaluation.
 
-    >>> round(float(two_sided(0.95, 2)), 3)
+    >>> round(float(t_half_width(0.95, 2)), 3)
     4.303
     """
     from scipy.special import stdtrit

@@ -71,7 +71,7 @@ NUMPY = [
     ("simulate nowhere --out new", "no scenario 'nowhere'"),
     ("simulate block --out new --lidar foo", "no LiDAR 'foo'"),
     ("osm show nowhere.osm", "nowhere.osm cannot be read"),
-    (f"convert {TRUTH} --to tum --out used/x", "used/x exists already"),
+    (f"convert {TRUTH} --to tum --out used/x", "used/x exists; name another file"),
 ]
 CASES = {
     "nothing": (NOTHING, (*HEAVY, "numpy", "pydantic")),

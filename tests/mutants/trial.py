@@ -17,6 +17,8 @@ from typing import Any
 
 from mutants.sites import Mutant
 
+from lslam.core.kernels.cache import kernel_sources
+
 PROJECT = Path(__file__).resolve().parents[2]
 TESTS = ("backend/graph", "backend/loops", "odometry/inertial", "evaluation", "registration", "core/kernels", "oracle")
 RESIDUALS = "lslam/registration/residuals.py"
@@ -106,7 +108,7 @@ class Copy:
         return sorted(names, key=lambda name: (stem not in name, name not in named, covered[name]["seconds"]))
 
     def _tests_of_kernel(self, stem: str, covered: dict[str, Any]) -> list[str]:
-        kernels = {path.stem: path.read_text() for path in (self.root / "lslam").glob("*/kernels/*.py")}
+        kernels = {path.stem: path.read_text() for path in kernel_sources(self.root / "lslam")}
         users = {stem} | {user for user, text in kernels.items() if f".kernels.{stem} import" in text}
         pattern = re.compile("|".join(rf"\.kernels\.{user}\b|kernels import .*\b{user}\b" for user in users))
         return [name for name in covered if pattern.search((self.root / name).read_text())]

@@ -145,7 +145,7 @@ def test_a_wrong_or_uncertain_first_match_does_not_move_the_run(
     monkeypatch.setattr(location, "match_keyframe", askew)
     store = driven(HOUSES, way)
     located = locate(extract_of(HOUSES), store, None, config())
-    assert located.accepted_matches[0].keyframe == 0
+    assert located.accepted[0].keyframe == 0
     laid = se2.of_se3(located.T_enu_odometry @ np.stack([k.T_world_lidar for k in store.keyframes])) - way
     assert np.abs(laid[:, :2]).max() < 0.3
     assert np.abs(np.degrees(laid[:, 2])).max() < 0.4

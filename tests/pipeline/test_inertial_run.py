@@ -25,7 +25,7 @@ from lslam.odometry import create_odometry
 from lslam.odometry.frontend.inertial_start import begin_inertial, close_inertial
 from lslam.odometry.frontend.register_scans import estimate
 from lslam.odometry.inertial.fusion import InertialMotion
-from lslam.pipeline.doctor import Finding
+from lslam.pipeline.doctor import Findings
 from lslam.pipeline.doctor.examine_turns import examine_turns
 from lslam.pipeline.run import run
 from lslam.pipeline.watch import RunOutcome
@@ -280,7 +280,7 @@ def test_late_stamps_are_found_and_the_imu_still_helps() -> None:
 @pytest.mark.parametrize("late_s", [0.0, 0.02])
 def test_the_doctor_does_not_take_motion_within_sweeps_for_a_time_offset(late_s: float) -> None:
     imu = imu_of(walk())
-    findings: list[Finding] = []
+    findings = Findings()
     facts = examine_turns(with_imu(dataclasses.replace(imu, stamps_ns=imu.stamps_ns + round(1e9 * late_s))), findings)
     assert facts is not None
     assert facts["time_offset_s"] == pytest.approx(-late_s, abs=0.002)

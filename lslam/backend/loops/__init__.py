@@ -6,17 +6,19 @@ here; others register an entry point `lslam.descriptors`.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol, cast
 
-import numpy as np
-from numpy.typing import NDArray
-
 from lslam.core.extras import factory, require
-from lslam.core.types.arrays import Longs
 
+# A command line that names a descriptor wrongly is answered without numpy.
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from lslam.core.config.backend import LoopsConfig
+    from lslam.core.types.arrays import Longs
 
 GROUP = "lslam.descriptors"
 # name -> (module with `create(config) -> PlaceDescriptor`, one line for people)
@@ -59,7 +61,7 @@ class PlaceDescriptor(Protocol):
     def add(self, number: int, points: NDArray[np.float32]) -> None:
         """Describe the cloud (N, 3), m, round keyframe `number`, level with z up; keyframes come once, in any order."""
 
-    def nearest(self, number: int, others: Longs, turn: float = np.pi) -> list[PlaceMatch]:
+    def nearest(self, number: int, others: Longs, turn: float = math.pi) -> list[PlaceMatch]:
         """Those of the keyframes `others` that look most like keyframe `number`, the best first; all must be known.
 
         turn : rad, headings differ by no more

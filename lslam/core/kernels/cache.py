@@ -56,10 +56,15 @@ def own_folder(folder: Path) -> Path:
         return folder
 
 
+def kernel_sources(package: Path) -> list[Path]:
+    """Files with kernels below the package's folder: a room has a folder of them, or one file."""
+    return sorted([*package.glob("*/kernels/*.py"), *package.glob("*/kernels.py")])
+
+
 def source_digest() -> str:
     """Digest of all kernel sources: numba checks the file of a kernel only, not the files of the functions it calls."""
     digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parents[2].glob("*/kernels/*.py")):
+    for path in kernel_sources(Path(__file__).parents[2]):
         digest.update(path.read_bytes())
     return digest.hexdigest()[:12]
 

@@ -65,7 +65,7 @@ def test_estimators_bend_less_than_least_squares(robust: str) -> None:
 
 def test_covariances_are_as_large_as_errors_are(monkeypatch: pytest.MonkeyPatch) -> None:
     """Normalised squared errors over simulated graphs, per degree of freedom, are 1 on average."""
-    for module in ("consistency", "drift", "loop_drift", "solve"):
+    for module in ("pose_graph", "drift", "loop_drift", "solve"):
         monkeypatch.setattr(f"lslam.backend.graph.{module}.RIGHT_PROBABILITY", 0.999999)
     ratios = []
     for seed in range(12):
