@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from calling import COMMAND, SAMPLE, environment, lslam_process, manifest
 
-from lslam.core.kernels import jit
+from lslam.core.kernels.cache import kernel_folder
 
 STARTS = 4
 # The fewest kernels that make a map: those of a map of given poses.
@@ -121,7 +121,7 @@ def test_nothing_is_written_beside_the_output_and_the_cache(tmp_path: Path) -> N
     home.mkdir()
     work.mkdir()
     # The kernels of these tests, compiled already, and the sources that they are of.
-    cache = str(jit.lock_file().parent)
+    cache = str(kernel_folder())
     env = environment(
         HOME=str(home), XDG_CACHE_HOME=str(home / ".cache"), NUMBA_CACHE_DIR=cache, PYTHONPATH=str(SAMPLE.parent)
     )

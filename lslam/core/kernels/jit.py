@@ -165,11 +165,6 @@ def _compile_inline(function: F, **more: bool) -> F:
     return cast(F, compiled)
 
 
-def lock_file() -> Path | None:
-    """Lock (`lslam.core.machine`) of the process that compiles ahead for others. None without a cache."""
-    return None if _folder is None else _folder / "compile.lock"
-
-
 @contextlib.contextmanager
 def announce_compiling(log: logging.Logger, on_first: Callable[[], None] = lambda: None) -> Iterator[None]:
     """Log a line when the first kernel is compiled within the block, and call `on_first`; loading kernels does neither."""
