@@ -33,8 +33,8 @@ from lslam.odometry.frontend.inertial_start import with_imu_settings
 from lslam.odometry.frontend.point_times import with_point_times
 from lslam.odometry.frontend.register_scans import sweep_of
 from lslam.odometry.frontend.scene_scale import LENGTHS, with_scene_scale, with_up
-from lslam.odometry.frontend.wheel_start import Wheels, begin_wheels
 from lslam.odometry.given import GivenMotion, GivenPoses
+from lslam.odometry.inertial.wheel_motion import Wheels, begin_wheels
 from lslam.osm.source import OsmSource, open_osm
 from lslam.pipeline.check import check_config
 from lslam.pipeline.doctor import Findings

@@ -34,10 +34,10 @@ from lslam.odometry.frontend.keyframing import Keyframing
 from lslam.odometry.frontend.register_scans import diverges, estimate, to_trajectory
 from lslam.odometry.frontend.segments import Begin
 from lslam.odometry.frontend.tracker import Tracker
-from lslam.odometry.frontend.wheel_start import close_wheels
 from lslam.odometry.given import GivenPoses
 from lslam.odometry.inertial.constant_velocity import ConstantVelocity, MotionModel
 from lslam.odometry.inertial.smoothing import SmootherMotion, smoother_noise
+from lslam.odometry.inertial.wheel_motion import close_wheels
 from lslam.odometry.integrity.monitor import IntegrityMonitor
 from lslam.odometry.scan_outcome import measurable
 from lslam.odometry.stationary import StationaryDetector

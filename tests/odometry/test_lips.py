@@ -29,8 +29,7 @@ from lslam.odometry.frontend.register_scans import read_ahead
 from lslam.odometry.frontend.tracker import Tracker
 from lslam.odometry.inertial.constant_velocity import middle_of
 from lslam.odometry.inertial.filter import Normal
-from lslam.odometry.inertial.linked_motion import LinkedMotion
-from lslam.odometry.lips import Lips
+from lslam.odometry.lips import LinkedMotion, Lips
 from lslam.odometry.scan_outcome import fault
 from lslam.simulation.scenarios import simulate
 
