@@ -36,7 +36,7 @@ def command(run: Path, **given: Any) -> None:
     out: Path = given["out"]
     options.require_there(given["gt"])
     from lslam.cli.one_run import read_truth
-    from lslam.pipeline.again import gather_figure, width_of, write_figure
+    from lslam.pipeline.plot_run import gather_figure, width_of, write_figure
     from lslam.pipeline.run_folder import require_new
     from lslam.reports.figures import require_figure
     from lslam.reports.picture import check_plot_path

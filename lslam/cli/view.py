@@ -77,7 +77,7 @@ def record(run: Path, path: Path, overwrite: bool) -> None:
     require_rerun()
     require_new(path, overwrite, "--rerun")
     require_run(run)
-    from lslam.pipeline.again import view_run
+    from lslam.pipeline.plot_run import view_run
 
     content = view_run(run)
     if not path.parent.is_dir():

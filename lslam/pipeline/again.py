@@ -1,9 +1,9 @@
-"""An earlier run taken up again: made once more by its folder alone, with another pose graph, or drawn."""
+"""An earlier run made once more by its folder alone and compared, or taken for another pose graph."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,29 +11,16 @@ from typing import Any
 from lslam.core import __version__
 from lslam.core.config import Config, load_config
 from lslam.core.errors import InputError, UsageError, input_errors
-from lslam.core.types.cloud import ArrayCloud
 from lslam.core.types.sequence import Sequence, select
 from lslam.core.types.trajectory import Trajectory
 from lslam.core.untrusted import MISFIT, parse_json
-from lslam.evaluation.evaluate import evaluate
-from lslam.io.formats.atomic import atomic_write
-from lslam.io.formats.point_files import read_cloud
-from lslam.io.formats.trajectory_files import read_trajectory
 from lslam.io.remote import as_path
-from lslam.odometry import create_odometry
-from lslam.odometry.base import FeatureSource
-from lslam.osm.buildings_geojson import read_buildings_geojson
 from lslam.osm.source import AUTO
 from lslam.pipeline.check import open_recording
-from lslam.pipeline.further_passes import view_features
-from lslam.pipeline.job import choose_scans
 from lslam.pipeline.manifest import machine_facts
-from lslam.pipeline.map_files import in_own_world
-from lslam.pipeline.rebuild import EarlierRun, is_missing, map_of, read_run, recording_of, results_of
+from lslam.pipeline.rebuild import EarlierRun, read_run, recording_of
 from lslam.pipeline.resume import INPUTS, input_digest
 from lslam.pipeline.run_folder import MANIFEST, OURS, REPLIES, require_odometry, require_run
-from lslam.reports.figures import ON_THE_MAP, WIDTHS, PlottedRun, draw_figure, require_figure
-from lslam.reports.picture import check_plot_path, house_style, picture
 
 log = logging.getLogger("lslam")
 # Sections that odometry does not look at.
@@ -231,87 +218,3 @@ def read_for_graph(folder: Path, settings: list[str]) -> EarlierRun:
         raise InputError(f"{folder} was located in a map, which takes the place of a pose graph")
     _require_same_odometry(run)
     return run
-
-
-def gather_figure(
-    folder: Path,
-    what: str,
-    sequence: Path | None = None,
-    truth_of: Callable[[Sequence], Trajectory | None] = lambda sequence: None,
-    **reading: Any,
-) -> PlottedRun:
-    """Parts of the run that the figure `what` needs.
-
-    sequence : where the raw scans have moved; truth_of : gives what replaces the recording's truth, None for nothing
-    reading : as `open_sequence`
-
-    Raises InputError naming what is missing, UsageError for an unknown figure.
-    """
-    require_figure(what)
-    run = read_run(folder)
-    about: dict[str, Any] = {"georeference": run.georeference}
-    if what in ON_THE_MAP:
-        about["cloud"] = view_run(folder).cloud
-    if what == "trajectory" and (folder / "trajectory_odometry.tum").is_file():
-        about["odometry"] = read_trajectory(folder / "trajectory_odometry.tum", "tum")
-    if what == "buildings" and (folder / "buildings.geojson").is_file():
-        about["buildings"] = read_buildings_geojson(folder / "buildings.geojson")
-    if what not in ON_THE_MAP and not (what == "trajectory" and sequence is None and is_missing(run)):
-        recording = open_again(run, sequence, **reading)
-        truth = truth_of(recording) or recording.ground_truth
-        if truth is not None and what in ("trajectory", "errors"):
-            about["evaluation"] = evaluate(run.trajectory, truth, run.config.eval, calibration=recording.calibration)
-        if what == "imu":
-            about["imu"] = recording.imu
-        if what == "features":
-            odometry = create_odometry(run.config)
-            if isinstance(odometry, FeatureSource):
-                scans = choose_scans(recording, odometry, run.config)
-                about["features"] = view_features(scans, odometry, results_of(run))
-    return PlottedRun(f"{run.name} ({folder.name})", run.trajectory, **about)
-
-
-def write_figure(run: PlottedRun, what: str, path: Path, width: float, font: float) -> None:
-    """Draw a figure into `path`, .png, .svg or .pdf, atomically; width : mm; font : points.
-
-    Raises UsageError for another suffix or a size that no page has, OutputError when it cannot be written.
-    """
-    check_plot_path(path)
-    if not 20 <= width <= 2000 or not 3 <= font <= 72:
-        raise UsageError(f"--width {width:g} --font {font:g}: 20 to 2000 mm, 3 to 72 points")
-    with house_style(font):
-        image = picture(draw_figure(run, what, width), path.suffix.lstrip(".").lower(), dpi=300)
-        with atomic_write(path) as stream:
-            stream.write(image)
-
-
-def width_of(text: str) -> float:
-    """Width of a figure, mm, from `column`, `page` or a number. Raises UsageError."""
-    if text in WIDTHS:
-        return WIDTHS[text]
-    try:
-        return float(text)
-    except ValueError:
-        raise UsageError(f"--width {text}: column, page, or mm") from None
-
-
-def view_run(folder: Path) -> PlottedRun:
-    """Trajectory, odometry if there was a back end, and map, all in the run's world.
-
-    Raises InputError naming what is missing or broken; a run without a map is shown without one.
-    """
-    run = read_run(folder)
-    odometry = None
-    if (folder / "trajectory_odometry.tum").is_file():
-        odometry = read_trajectory(folder / "trajectory_odometry.tum", "tum")
-    return PlottedRun(f"{run.name} ({folder.name})", run.trajectory, odometry, cloud=_cloud(folder))
-
-
-def _cloud(folder: Path) -> ArrayCloud | None:
-    """Map of the run; LAS of a georeferenced run is transformed back to its world."""
-    try:
-        path = map_of(folder)
-    except InputError as error:
-        log.warning("%s", error)
-        return None
-    return in_own_world(path, read_cloud(path))[0]

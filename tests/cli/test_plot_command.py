@@ -12,7 +12,7 @@ from calling import SAMPLE, assert_one_sentence, lslam
 import lslam as lslam_api
 from lslam.core.config import load_config
 from lslam.evaluation.metric import AbsoluteError
-from lslam.pipeline.again import gather_figure
+from lslam.pipeline.plot_run import gather_figure
 from lslam.reports.figures import draw_figure
 from lslam.reports.picture import house_style
 

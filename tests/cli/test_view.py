@@ -23,8 +23,8 @@ from lslam.core.types.trajectory import Trajectory
 from lslam.io.formats.point_files import read_cloud
 from lslam.io.formats.trajectory_lines import write_tum
 from lslam.maps.octree import points_of
-from lslam.pipeline.again import view_run
 from lslam.pipeline.map_files import MapNote, georeference_note, write_map
+from lslam.pipeline.plot_run import view_run
 from lslam.pipeline.view.sites import MapTiles
 from lslam.reports.figures import MOST_POINTS, by_height
 

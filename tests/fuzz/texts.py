@@ -30,7 +30,7 @@ from lslam.io.readers.scan_stamps import stamps_in_names
 from lslam.osm.bounds import Bounds
 from lslam.osm.buildings_geojson import read_buildings_geojson
 from lslam.osm.overpass import kept_reply
-from lslam.pipeline.again import view_run
+from lslam.pipeline.plot_run import view_run
 from lslam.pipeline.rebuild import map_of, read_run
 from lslam.pipeline.resume import may_go_on
 from lslam.simulation.osm_extract import read_perturbation
