@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lslam.backend.fix_faults import fit_pose
+from lslam.backend.fixes import fit_pose
 from lslam.backend.georeferencing import LEVELLED, UNLEVELLED, Placement, on_earth
 from lslam.backend.graph.fix_errors import heading_change
 from lslam.backend.graph.odometry_constraints import odometry_constraints

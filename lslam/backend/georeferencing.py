@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.backend.fix_faults import (
+from lslam.backend.fixes import (
     Faults,
     Fixes,
     GnssAlignment,

@@ -24,7 +24,7 @@ from lslam.backend.control_points import (
     control_residuals,
     with_control,
 )
-from lslam.backend.fix_faults import Fixes
+from lslam.backend.fixes import Fixes
 from lslam.backend.georeferencing import Placement, final_fixes, on_earth, place
 from lslam.backend.graph.drift import tilt_factor
 from lslam.backend.graph.odometry_constraints import (

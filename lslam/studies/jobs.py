@@ -21,7 +21,7 @@ from lslam.io.formats.atomic import write_text
 from lslam.io.remote import RemotePath
 from lslam.pipeline.run_folder import spool_of
 from lslam.studies.grid import Job
-from lslam.studies.options import WORDS, OutputOptions, lock_output, release_output
+from lslam.studies.options import WORDS, OutputOptions, make_output, release_output
 from lslam.studies.results import Results
 from lslam.studies.results_csv import State, is_reusable, read_state, write_state
 from lslam.studies.runner import StudyProgress, Task, WorkerPool, run_tasks
@@ -189,9 +189,9 @@ def simulate_scenes(jobs: Sequence[Job], most_at_once: int, progress: StudyProgr
 def study_folder(output: OutputOptions, mark: str, jobs: Sequence[Job]) -> Iterator[None]:
     """Make the folder of a study before the block, and remove it if the block fails before anything else is in it.
 
-    Raises as `lock_output`; InterruptedRunError, with the number of finished `jobs`, for Ctrl-C or SIGTERM in the block.
+    Raises as `make_output`; InterruptedRunError, with the number of finished `jobs`, for Ctrl-C or SIGTERM in the block.
     """
-    lock_output(output, mark)
+    make_output(output, mark)
     try:
         yield
     except KeyboardInterrupt:

@@ -44,7 +44,7 @@ def folder_by_time(name: str) -> Path:
     return Path("runs") / time.strftime(f"{name}-%Y%m%d-%H%M%S")
 
 
-def lock_output(output: OutputOptions, mark: str) -> None:
+def make_output(output: OutputOptions, mark: str) -> None:
     """Make the output folder, or raise as `require_free`; the caller writes the file `mark`, which identifies what it holds."""
     require_free(output, mark)
     with output_errors(f"output folder {output.out}"):

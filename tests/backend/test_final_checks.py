@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lslam.backend.fix_faults import Fixes
+from lslam.backend.fixes import Fixes
 from lslam.backend.optimise import fixes_against_points, redundancy, thickening, thicker_map
 from lslam.core.geometry import geodesy
 from lslam.core.types.constraint import ControlPoint, Instant

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lslam.backend.fix_faults import align
+from lslam.backend.fixes import align
 from lslam.backend.graph import factors, fix_noise
 from lslam.backend.graph.fix_noise import DriftOfFixes, GaussMarkovNoise, fit_gauss_markov
 from lslam.backend.graph.problem import PositionFix

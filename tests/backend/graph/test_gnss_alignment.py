@@ -7,7 +7,7 @@ import pytest
 from graph_builders import truth
 from scipy.stats import chi2
 
-from lslam.backend.fix_faults import align
+from lslam.backend.fixes import align
 from lslam.core.geometry import se3, so3
 
 PATH = truth(200, 2, radius=80.0)[:, :3, 3]
