@@ -161,22 +161,21 @@ def command(target: Path, **given: Any) -> None:
 
 def _measure(target: Path, given: dict[str, Any]) -> None:
     options.require_there(target, given["against"])
-    from lslam.io.formats.point_files import read_cloud
     from lslam.maps.crispness import RADIUS, THRESHOLD, compare, crispness
-    from lslam.pipeline.rebuild import map_of
+    from lslam.pipeline.stored_map import map_of
     from lslam.reports.evaluations import crispness_document, strict
 
-    path = map_of(target)
-    cloud = read_cloud(path)
-    document: dict[str, Any] = {"file": str(path)}
-    rows = [("map", str(path))]
+    stored = map_of(target)
+    cloud = stored.read(in_world=False)
+    document: dict[str, Any] = {"file": str(stored.path)}
+    rows = [("map", str(stored.path))]
     if given["scores"]:
         score = crispness(cloud, given["radius"] or RADIUS)
         document["crispness"] = crispness_document(score)
         rows += crispness_rows(score)
     if given["against"] is not None:
         threshold = THRESHOLD if given["threshold"] is None else given["threshold"]
-        match = compare(cloud, read_cloud(given["against"]), threshold)
+        match = compare(cloud, map_of(given["against"]).read(in_world=False), threshold)
         document["against"] = strict({"file": str(given["against"]), "recipe": match.recipe, **asdict(match)})
         to, back = match.mean_to_reference, match.mean_from_reference
         rows += [

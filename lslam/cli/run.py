@@ -15,7 +15,7 @@ from lslam.cli.console import log, progress, setup_logging, show
 from lslam.cli.one_run import arguments_of, print_result, read_truth
 from lslam.core.errors import GateError, UsageError
 from lslam.core.machine import rarely_collecting
-from lslam.io.remote import RemotePath, as_path
+from lslam.io.remote import as_path
 from lslam.registration.residuals import RESIDUALS, find_residual
 
 if TYPE_CHECKING:
@@ -241,9 +241,6 @@ def run_again(folder: Path, recording: str | None, given: dict[str, Any]) -> Non
     for name, option in options.typed_options().items():
         if name not in _FREE:
             raise UsageError(f"{option} is not for --again, which takes all of that from the run: leave it out")
-    for option, place in (("--again", folder), ("--out", given["out"])):
-        if isinstance(place, RemotePath):
-            raise UsageError(f"{option} {place}: --again compares folders of this machine, name one")
     out = given["out"] or folder.absolute().with_name(f"{folder.absolute().name}-again")
     from lslam.core.types.warned import collect_warnings
     from lslam.pipeline.again import (

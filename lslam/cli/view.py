@@ -20,6 +20,7 @@ HELP = f"""Show a run in the browser: its report with all points of the map, and
 
 The page is served to this machine alone, at an address that nobody else knows, until Ctrl-C. What is corrected there goes into
 edits.csv and points.csv of the run folder, and the graph that is made with them into a new folder beside it.
+RUN may be the folder of a merge, whose map is shown and whose loops are corrected in its runs.
 
 \b
 --rerun writes a recording for the rerun viewer instead, which it needs: {install_command("view")}
@@ -93,9 +94,8 @@ def serve(run: Path, port: int, opens: bool) -> None:
 
     require_run(run)
     from lslam.pipeline.view.server import RunServer
-    from lslam.pipeline.view.sites import ViewedSites, require_one_run, require_page
+    from lslam.pipeline.view.sites import ViewedSites, require_page
 
-    require_one_run(run)
     require_page(run)
     stop = current()
     # The server ends with its terminal, unless nohup says otherwise.

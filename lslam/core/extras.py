@@ -88,6 +88,7 @@ def importing_open3d() -> Iterator[None]:
         yield
 
 
+PLUGIN_GROUPS = ("lslam.methods", "lslam.readers", "lslam.descriptors")
 # name -> (module with `create`, one line for people)
 Table = Mapping[str, tuple[str, str]]
 
@@ -103,6 +104,15 @@ def find_plugins(group: str, own: Mapping[str, object]) -> dict[str, EntryPoint]
         entry_points(group=group), key=lambda entry: "" if entry.dist is None else entry.dist.name, reverse=True
     )
     return {entry.name: entry for entry in entries if entry.name not in own}
+
+
+def plugin_versions() -> dict[str, str]:
+    """Versions of the packages that register anything for lslam, by their names."""
+    from importlib.metadata import entry_points
+
+    known = entry_points()
+    entries = [entry for group in PLUGIN_GROUPS for entry in known.select(group=group)]
+    return {entry.dist.name: entry.dist.version for entry in entries if entry.dist is not None}
 
 
 def summarise(group: str, own: Table) -> dict[str, str]:

@@ -14,7 +14,7 @@ from lslam.backend.georeferencing import require_gnss
 from lslam.backend.keyframes.store import KeyframeStore
 from lslam.backend.manual import read_manual
 from lslam.core.config import Config, load_config
-from lslam.core.errors import InputError, InterruptedRunError
+from lslam.core.errors import InputError, InterruptedRunError, UsageError
 from lslam.core.geometry import se3
 from lslam.core.stopping import asking
 from lslam.core.types.camera import cameras_of
@@ -41,8 +41,8 @@ from lslam.pipeline.doctor import Findings
 from lslam.pipeline.doctor.examine_positions import examine_jumps, examine_units
 from lslam.pipeline.manifest import Manifest, describe_deskew
 from lslam.pipeline.map_pass import KEY, needs_labels, with_attributes
-from lslam.pipeline.map_tiles import require_map
 from lslam.pipeline.run_folder import RunFolder
+from lslam.pipeline.stored_map import map_of
 from lslam.pipeline.watch import Watch
 from lslam.registration.preprocessing.views import WithoutClasses, with_rings
 
@@ -101,7 +101,11 @@ def prepare(
         sequence.notes.extend(bind(odometry, sequence))
         poses = odometry.trajectory
     if config.localize.map:
-        require_map(Path(config.localize.map), config.gnss.mode != "off")
+        stored = map_of(Path(config.localize.map))
+        if config.gnss.mode != "off" and stored.georeference is None:
+            raise UsageError(
+                f"--gnss: {stored.path} is not georeferenced; say where the drive begins with --start X,Y,HEADING"
+            )
     scans = choose_scans(sequence, odometry, config)
     if config.map.write:
         with_attributes(scans, config)  # before the odometry and not after it

@@ -20,6 +20,7 @@ from typing import Any
 from lslam.core import __version__
 from lslam.core.config import Config
 from lslam.core.errors import InterruptedRunError
+from lslam.core.extras import plugin_versions
 from lslam.core.stopping import is_interrupt
 from lslam.core.types.run_record import RunRecord
 from lslam.core.types.scan import Span
@@ -211,12 +212,13 @@ class Manifest:
 
 
 def machine_facts() -> dict[str, str | None]:
-    """Python, system, a digest of lslam's own code, and versions of libraries; None for one that is not installed."""
+    """Python, system, a digest of lslam's own code, versions of libraries, None where not installed, and of plug-ins."""
     return {
         "code": _code_digest(),
         "python": sys.version.split()[0],
         "platform": platform.platform(),
         **{name: _version(name) for name in LIBRARIES},
+        **plugin_versions(),
     }
 
 

@@ -280,15 +280,3 @@ def georeference_of(note: Any) -> Georeference | None:
         )
     except MISFIT:
         return None
-
-
-def in_own_world(path: Path, cloud: ArrayCloud) -> tuple[ArrayCloud, Georeference | None]:
-    """Map in the world of the run that wrote it, and its georeference.
-
-    A map of another program, or without a georeference, stays in its own coordinates.
-    """
-    about = note_of(path)
-    georeference = georeference_of(about.get("georeference"))
-    if about.get("crs") is None or georeference is None:
-        return cloud, georeference
-    return ArrayCloud(Projection(georeference).invert(cloud.points), cloud.intensity), georeference

@@ -32,28 +32,21 @@ from lslam.core.types.sequence import Sequence
 from lslam.io.formats.atomic import write_text
 from lslam.io.formats.copc_files import SUFFIX as COPC
 from lslam.io.formats.las_files import is_extra
-from lslam.io.formats.point_files import MAP_SUFFIXES, SUFFIXES, read_cloud, write_cloud
+from lslam.io.formats.point_files import write_cloud
 from lslam.io.formats.text_tables import utc_of
 from lslam.maps.georeference import ProjectedCloud, Projection, to_wgs84
 from lslam.pipeline.further_passes import build_finished_map
-from lslam.pipeline.map_files import (
-    MapNote,
-    georeference_of,
-    in_own_world,
-    note_of,
-    projection_of,
-    read_json,
-    write_json,
-)
+from lslam.pipeline.map_files import MapNote, projection_of, write_json
 from lslam.pipeline.map_pass import INTERRUPTED
 from lslam.pipeline.merge_runs import read_session
-from lslam.pipeline.rebuild import EarlierRun, map_of, place_of, results_of
-from lslam.pipeline.run_folder import SPOOL, require_run
+from lslam.pipeline.rebuild import EarlierRun, place_of, results_of
+from lslam.pipeline.run_folder import SPOOL
+from lslam.pipeline.stored_map import INDEX, is_tiles, map_of
 from lslam.pipeline.watch import SILENT, Watch
 from lslam.registration.preprocessing.ground import Z
 
 log = logging.getLogger("lslam")
-INDEX, SCHEMA = "map.json", 1
+SCHEMA = 1
 # Points that wait for their tiles' files, so that a map of any size needs little memory and few open files.
 MOST_WAITING = 1 << 22
 # Index of the tiles as a virtual point cloud: STAC items of the files, which QGIS opens as one layer.
@@ -190,21 +183,6 @@ def _part(spool: Path, key: tuple[int, int]) -> Path:
     return spool / f"{key[0]}_{key[1]}.points"
 
 
-def is_tiles(folder: Path) -> bool:
-    """Whether a folder holds tiles with their index."""
-    return folder.is_dir() and read_json(folder / INDEX).get("kind") == "tiles"
-
-
-def read_tiles(folder: Path) -> tuple[ArrayCloud, dict[str, Any]]:
-    """All points of the tiles, m, as their files have them, and the index; raises InputError naming what is missing."""
-    index = read_json(folder / INDEX)
-    names = [str(tile.get("file", "")) for tile in index.get("tiles", []) if isinstance(tile, dict)]
-    if not names or any(Path(name).name != name for name in names):
-        raise InputError(f"{folder / INDEX} lists no tiles")
-    parts = [read_cloud(folder / name) for name in names]
-    return ArrayCloud(np.concatenate([part.points for part in parts])), index
-
-
 def check_tiles(folder: Path, size: float, overwrite: bool) -> None:
     """Raise UsageError, OutputExistsError or OutputError for an impossible output of tiles, before any work is done."""
     if not 1.0 <= size <= 10_000.0:
@@ -258,51 +236,19 @@ def _schema(name: str, kind: np.dtype[Any]) -> Mapping[str, Any]:
     return {"name": name, "size": kind.itemsize, "type": _KINDS[kind.kind]}
 
 
-def require_map(target: Path, needs_place: bool = False) -> Path:
-    """Cloud file of a map, or its folder of tiles, without reading it. Raises InputError when there is none.
-
-    needs_place : satellite fixes are to lead into it. Raises UsageError when nobody knows where it lies on the Earth.
-    """
-    path = _cloud_file(target)
-    about = read_json(path / INDEX) if is_tiles(path) else note_of(path)
-    if needs_place and georeference_of(about.get("georeference")) is None:
-        raise UsageError(f"--gnss: {path} is not georeferenced; say where the drive begins with --start X,Y,HEADING")
-    return path
-
-
-def _cloud_file(target: Path) -> Path:
-    if is_tiles(target):
-        return target
-    if target.is_dir():
-        require_run(target)
-        return map_of(target)
-    if not target.exists():
-        raise InputError(f"the map {target} does not exist")
-    if target.suffix.lower() not in (*MAP_SUFFIXES, *SUFFIXES):
-        raise InputError(
-            f"the map {target} is no run folder and no cloud: known suffixes are {', '.join(MAP_SUFFIXES)}"
-        )
-    return target
-
-
 def read_prior_map(target: Path, config: RegistrationConfig) -> PriorMap:
     """Read the map, in coordinates near it: those of the run, or of the file less whole kilometres.
 
     Raises InputError naming what is missing or broken.
     """
-    path = require_map(target)
-    if is_tiles(path):
-        cloud, index = read_tiles(path)
-        georeference = georeference_of(index.get("georeference"))
-        if index.get("crs") is not None and georeference is not None:
-            cloud = ArrayCloud(Projection(georeference).invert(cloud.points))
-    else:
-        cloud, georeference = in_own_world(path, read_cloud(path))
-    points, origin = cloud.points, np.zeros(3)
+    stored = map_of(target)
+    points, origin = stored.read().points, np.zeros(3)
     if len(points) and float(np.abs(points).max()) > LARGE:
         origin = np.round(np.nanmedian(points, axis=0) / KILOMETRE) * KILOMETRE
-        log.info("coordinates of %s are large: the world of this run begins at %s of them", path, origin.tolist())
-    return make_prior_map(points, config, georeference, str(path), origin, _up_of(path.parent))
+        log.info(
+            "coordinates of %s are large: the world of this run begins at %s of them", stored.path, origin.tolist()
+        )
+    return make_prior_map(points, config, stored.georeference, str(stored.path), origin, _up_of(stored.path.parent))
 
 
 def _up_of(folder: Path) -> Floats:

@@ -24,6 +24,7 @@ from lslam.core.stopping import asking
 from lslam.core.types.arrays import Floats
 from lslam.core.types.constraint import LoopCandidate
 from lslam.core.types.scan_result import ScanResult
+from lslam.core.untrusted import MISFIT
 from lslam.io.formats.state_files import Records, read_npz
 from lslam.odometry.frontend.checkpoints import Checkpoints
 from lslam.pipeline.map_files import read_json
@@ -75,7 +76,7 @@ def expand_folders(folders: Sequence[Path]) -> list[Path]:
     out: list[Path] = []
     for folder in folders:
         inside = sessions_of(folder)
-        out += [folder] if inside is None else inside
+        out += [folder] if inside is None else inside.values()
     for folder, count in Counter(folder.resolve() for folder in out).items():
         if count > 1:
             raise UsageError(f"{folder} is named twice")
@@ -84,12 +85,18 @@ def expand_folders(folders: Sequence[Path]) -> list[Path]:
     return out
 
 
-def sessions_of(folder: Path) -> list[Path] | None:
-    """Run folders behind a merged folder, None for the folder of a single run."""
+def sessions_of(folder: Path) -> dict[str, Path] | None:
+    """Run folders behind a merged folder by the names of its sessions, None for the folder of a single run.
+
+    Raises InputError where the manifest does not list them.
+    """
     manifest = read_json(folder / MANIFEST)
     if manifest.get("kind") != "merge":
         return None
-    return [Path(str(one["run"])) for one in manifest.get("sessions", [])]
+    try:
+        return {str(row["name"]): Path(row["run"]) for row in manifest["sessions"]}
+    except MISFIT as error:
+        raise InputError(f"{folder / MANIFEST}: sessions: {error}; merge the runs again") from None
 
 
 def read_session(folder: Path, name: str) -> tuple[EarlierRun, Session]:

@@ -8,12 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from lslam.core.errors import InputError, UsageError
-from lslam.core.types.cloud import ArrayCloud
 from lslam.core.types.sequence import Sequence
 from lslam.core.types.trajectory import Trajectory
 from lslam.evaluation.evaluate import evaluate
 from lslam.io.formats.atomic import atomic_write
-from lslam.io.formats.point_files import read_cloud
 from lslam.io.formats.trajectory_files import read_trajectory
 from lslam.odometry import create_odometry
 from lslam.odometry.base import FeatureSource
@@ -21,8 +19,8 @@ from lslam.osm.buildings_geojson import read_buildings_geojson
 from lslam.pipeline.again import open_again
 from lslam.pipeline.further_passes import view_features
 from lslam.pipeline.job import choose_scans
-from lslam.pipeline.map_files import in_own_world
-from lslam.pipeline.rebuild import is_missing, map_of, read_run, results_of
+from lslam.pipeline.rebuild import is_missing, read_run, results_of
+from lslam.pipeline.stored_map import map_of
 from lslam.reports.figures import ON_THE_MAP, WIDTHS, PlottedRun, draw_figure, require_figure
 from lslam.reports.picture import check_plot_path, house_style, picture
 
@@ -100,14 +98,10 @@ def view_run(folder: Path) -> PlottedRun:
     odometry = None
     if (folder / "trajectory_odometry.tum").is_file():
         odometry = read_trajectory(folder / "trajectory_odometry.tum", "tum")
-    return PlottedRun(f"{run.name} ({folder.name})", run.trajectory, odometry, cloud=_cloud(folder))
-
-
-def _cloud(folder: Path) -> ArrayCloud | None:
-    """Map of the run; LAS of a georeferenced run is transformed back to its world."""
     try:
-        path = map_of(folder)
+        stored = map_of(folder)
     except InputError as error:
         log.warning("%s", error)
-        return None
-    return in_own_world(path, read_cloud(path))[0]
+        stored = None
+    cloud = None if stored is None else stored.read()
+    return PlottedRun(f"{run.name} ({folder.name})", run.trajectory, odometry, cloud=cloud)

@@ -50,7 +50,6 @@ from lslam.pipeline.map_files import (
     is_note,
     note_of,
     note_with,
-    noted_last,
     read_json,
     write_json,
     write_run_map,
@@ -322,16 +321,6 @@ def covariances_of(run: EarlierRun) -> Floats | None:
     if C is None or C.shape != (len(run.trajectory), 6, 6):
         return None
     return np.where(np.isfinite(C).all((1, 2), keepdims=True), C, np.nan)
-
-
-def map_of(target: Path) -> Path:
-    """Map file, or the one written last in a run folder. Raises InputError when there is none."""
-    if not target.is_dir():
-        return target
-    maps = [target / f"map{suffix}" for suffix in MAP_SUFFIXES if (target / f"map{suffix}").is_file()]
-    if not maps:
-        raise InputError(f"{target} has no map file; build one with: lslam map {target}")
-    return noted_last(maps[0]) or maps[0]
 
 
 def _statuses(path: Path, count: int) -> tuple[Status, ...]:

@@ -14,8 +14,7 @@ from lslam.core.types.cloud import ArrayCloud
 from lslam.core.types.run_record import RunRecord
 from lslam.core.types.trajectory import Trajectory
 from lslam.evaluation.evaluate import Evaluation
-from lslam.io.formats.point_files import read_cloud
-from lslam.pipeline.map_files import in_own_world
+from lslam.pipeline.stored_map import map_of
 from lslam.reports.figures import ON_THE_MAP, PlottedRun, draw_figure
 from lslam.reports.picture import WIDTH, as_html, draw_svg
 from lslam.reports.plots import first_available
@@ -42,8 +41,7 @@ class RunOutcome:
         """The merged map in the run's world, read from its folder; None where none was written."""
         if self.record.folder is None or not self.record.map_file:
             return None
-        path = self.record.folder / self.record.map_file
-        return in_own_world(path, read_cloud(path))[0]
+        return map_of(self.record.folder / self.record.map_file).read()
 
     @property
     def errors(self) -> Floats | None:

@@ -25,7 +25,7 @@ from lslam.reports.html import flatten
 from lslam.reports.page_data import MapFigure, cloud_data, map_figure, pack, ways_data
 from lslam.reports.plots import DISTANCE, LIMIT_IN_VIEW, Figure, legend_of, line_figure
 from lslam.reports.png import VIRIDIS, Crop, choose_crops, crop_images, data_uri, density_png
-from lslam.reports.shell import MAP, render
+from lslam.reports.shell import MAP, RUN, render
 from lslam.reports.svg import Track, plane_chart
 
 MAP_POINTS = 100_000  # under the trajectories
@@ -358,7 +358,7 @@ def write_merge_page(
     sessions_data = ways_data(ways, [s.scans for s in sessions], before)
     page = render(
         "merge.html.j2",
-        MAP,
+        RUN,
         names=names,
         problems=problems,
         figures=figures,

@@ -33,6 +33,7 @@ from lslam.io.formats.trajectory_lines import write_tum
 from lslam.maps.occupancy import OccupancyGrid
 from lslam.pipeline.back_end_pass import describe
 from lslam.pipeline.map_files import MapNote, write_map, write_occupancy
+from lslam.pipeline.map_tiles import write_tiles
 from lslam.pipeline.outputs import config_text, write_loops
 
 ORIGIN = np.array([49.0113, 8.4256, 116.4])
@@ -78,7 +79,10 @@ def spread(count: int, seed: int, metres: float) -> Floats:
 
 
 def made(folder: Path, format_: str = "ply", is_placed: bool = True, **about: Any) -> MadeRun:
-    """A run of exact poses and an exact map: a square of points, and a post of fifty alone beside it."""
+    """A run of exact poses and an exact map: a square of points, and a post of fifty alone beside it.
+
+    format_ : suffix of the map, "laz in tiles" for one of tiles alone
+    """
     folder.mkdir(parents=True)
     post = ORIGIN + np.array([60 / 111_000, 60 / 73_000, 0.0])
     beyond = ORIGIN + np.array([80 / 111_000, 80 / 73_000, 0.0])
@@ -112,8 +116,13 @@ def made(folder: Path, format_: str = "ply", is_placed: bool = True, **about: An
     }  # fmt: skip
     (folder / "manifest.json").write_text(json.dumps(document))
     note = MapNote("drive", 0.2, attributes={name: name for name in ("time", "scan", "class")})
-    intensity = np.linspace(0, 1, count).astype(np.float32)
-    write_map(folder / f"map.{format_}", ArrayCloud(world_of(places), intensity, columns), note, place)
+    cloud = ArrayCloud(world_of(places), np.linspace(0, 1, count).astype(np.float32), columns)
+    suffix, _, tiled = format_.partition(" ")
+    if tiled:
+        (folder / "tiles").mkdir()
+        write_tiles(folder / "tiles", cloud, note, 25.0, suffix, place)
+    else:
+        write_map(folder / f"map.{suffix}", cloud, note, place)
     candidates = [
         LoopCandidate(0, 9, 1.0, 0.1, Verdict.ACCEPTED, LoopStage.GRAPH, overlap=0.9),
         LoopCandidate(1, 5, 2.0, 0.3, Verdict.REJECTED, LoopStage.OVERLAP, "overlap 0.1"),

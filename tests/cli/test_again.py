@@ -39,12 +39,6 @@ def run(recording: Path) -> Path:
     return recording.parent / "first"
 
 
-def test_a_run_in_storage_is_named_as_it_was_typed() -> None:
-    done = lslam("run", "--again", "s3://bucket/x")
-    assert done.returncode == 2
-    assert "--again s3://bucket/x: --again compares folders of this machine" in done.stderr
-
-
 def again(run: Path, *words: object, cwd: Path | None = None) -> Done:
     return lslam("run", "--again", run, *words, cwd=cwd)
 

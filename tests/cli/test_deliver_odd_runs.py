@@ -46,7 +46,7 @@ from lslam.io.formats.trajectory_lines import write_tum
 from lslam.pipeline.back_end_pass import describe
 from lslam.pipeline.deliver import deliver_run
 from lslam.pipeline.outputs import write_loops
-from lslam.pipeline.rebuild import map_of
+from lslam.pipeline.stored_map import map_of
 from tests.maps.geoid_grids import write_gtx
 
 
@@ -101,7 +101,7 @@ def test_a_plane_that_stretches_lengths_is_none_for_a_survey(
 
 def test_a_run_without_a_map_delivers_the_rest_and_says_it(tmp_path: Path) -> None:
     run = made(tmp_path / "town")
-    map_of(run.folder).unlink()
+    map_of(run.folder).path.unlink()
     out = delivered(run, tmp_path / "out")
     assert {path.name for path in out.iterdir()} == FILES - {"map.laz", "plan.tif"}
     for words in (text_of(out / "sheet.pdf")[1], flat(out / "README.txt")):

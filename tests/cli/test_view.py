@@ -72,7 +72,7 @@ def test_tiles_of_a_map_in_utm_lie_in_the_world_of_the_run(
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     for _ in ("built", "from the cache"):
-        tiles = MapTiles(run, np.zeros((1, 3)))
+        tiles = MapTiles(run, [np.zeros((1, 3))])
         tiles.start()
         for _ in range(200):
             if "nodes" in tiles.tree():
@@ -85,7 +85,7 @@ def test_tiles_of_a_map_in_utm_lie_in_the_world_of_the_run(
         assert away.max() < 0.003
     assert tiles.node("r0") is None
     (run / "map.laz").unlink()
-    bare = MapTiles(run, np.zeros((1, 3)))
+    bare = MapTiles(run, [np.zeros((1, 3))])
     bare.start()
     bare.stop()
     assert "no map file" in bare.tree()["error"]

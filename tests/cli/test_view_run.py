@@ -26,7 +26,7 @@ from lslam.core.geometry import se3
 from lslam.io.formats.trajectory_files import read_trajectory
 from lslam.io.readers import open_sequence
 from lslam.pipeline.view.server import RunServer
-from lslam.pipeline.view.sites import ViewedSites, change_between, require_one_run
+from lslam.pipeline.view.sites import ViewedSites, change_between, require_page
 
 # Beyond the gates of loops: none closes by itself.
 DRIFT = ("--set", "debug.drift=true", "--set", "debug.drift_percent=4", "--set", "debug.drift_deg_per_100m=12")
@@ -258,13 +258,7 @@ def test_a_run_that_is_none_and_a_port_in_use_are_said(lost: Path, tmp_path: Pat
     assert lslam("view", lost, "--overwrite").returncode == 2
 
 
-def test_a_merge_and_a_run_without_a_pose_are_not_sent_in_a_circle(tmp_path: Path) -> None:
-    for name, manifest, said in (
-        ("merged", {"kind": "merge"}, "is a merge of several runs: open"),
-        ("nowhere", {"status": "failed"}, "ended before it had a pose"),
-    ):
-        folder = tmp_path / name
-        folder.mkdir()
-        (folder / "manifest.json").write_text(json.dumps(manifest))
-        with pytest.raises(InputError, match=said):
-            require_one_run(folder)
+def test_a_run_without_a_pose_is_not_sent_in_a_circle(tmp_path: Path) -> None:
+    (tmp_path / "manifest.json").write_text(json.dumps({"status": "failed"}))
+    with pytest.raises(InputError, match="ended before it had a pose"):
+        require_page(tmp_path)

@@ -31,8 +31,9 @@ from lslam.osm.bounds import Bounds
 from lslam.osm.buildings_geojson import read_buildings_geojson
 from lslam.osm.overpass import kept_reply
 from lslam.pipeline.plot_run import view_run
-from lslam.pipeline.rebuild import map_of, read_run
+from lslam.pipeline.rebuild import read_run
 from lslam.pipeline.resume import may_go_on
+from lslam.pipeline.stored_map import map_of
 from lslam.simulation.osm_extract import read_perturbation
 from lslam.simulation.record import read_mark
 from lslam.simulation.routes import read_way_points

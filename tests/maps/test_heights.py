@@ -19,7 +19,8 @@ from lslam.core.geometry.geodesy import geoid_heights, local_crs
 from lslam.core.types.cloud import ArrayCloud
 from lslam.core.types.gnss import Georeference
 from lslam.maps.georeference import Projection, to_wgs84
-from lslam.pipeline.map_files import MapNote, georeference_note, georeference_of, in_own_world, write_map
+from lslam.pipeline.map_files import MapNote, georeference_note, georeference_of, write_map
+from lslam.pipeline.stored_map import map_of
 from tests.maps.geoid_grids import write_gtx
 
 KARLSRUHE = np.array([49.0113, 8.4256, 116.4])
@@ -82,8 +83,7 @@ def test_a_geoid_gives_the_heights(codes: tuple[int, int | None], grid: str, tmp
     about = json.loads((tmp_path / "map.json").read_text())
     assert about["frame"].endswith("heights above the geoid of geoid.gtx")
     assert about["georeference"]["geoid"] == grid
-    back, _ = in_own_world(tmp_path / "map.laz", ArrayCloud.of(laspy.read(tmp_path / "map.laz").xyz))
-    np.testing.assert_allclose(back.points, points, atol=0.002)
+    np.testing.assert_allclose(map_of(tmp_path / "map.laz").read().points, points, atol=0.002)
 
 
 def test_a_plane_without_heights_says_none(tmp_path: Path) -> None:

@@ -20,7 +20,8 @@ from lslam.maps.colour import ColouredCloud
 from lslam.maps.georeference import ProjectedCloud, Projection
 from lslam.pipeline import map_tiles
 from lslam.pipeline.map_files import MapNote
-from lslam.pipeline.map_tiles import check_tiles, is_tiles, read_tiles, write_tiles
+from lslam.pipeline.map_tiles import check_tiles, write_tiles
+from lslam.pipeline.stored_map import is_tiles, map_of
 
 NOTE = MapNote("drive", 0.2)
 POINTS = np.random.default_rng(3).uniform([-70, -30, -2], [90, 45, 6], (5000, 3))
@@ -37,7 +38,7 @@ def test_each_point_lies_in_its_tile_and_in_no_other(suffix: str, tmp_path: Path
         assert (np.floor((points[:, :2] + 1e-4) / 25.0) >= [x, y]).all()
         assert (np.floor((points[:, :2] - 1e-3) / 25.0) <= [x, y]).all()
         assert len(points) == tile["points"]
-    whole, _ = read_tiles(tmp_path)
+    whole = map_of(tmp_path).read()
     away, nearest = cKDTree(POINTS).query(whole.points)
     assert away.max() < 0.002
     assert sorted(nearest.tolist()) == list(range(5000))
@@ -133,10 +134,10 @@ def test_a_missing_tile_is_named(tmp_path: Path) -> None:
     (tmp_path / index["tiles"][1]["file"]).unlink()
     assert is_tiles(tmp_path)
     with pytest.raises(InputError, match=index["tiles"][1]["file"]):
-        read_tiles(tmp_path)
+        map_of(tmp_path).read()
 
 
 def test_an_index_cannot_point_elsewhere(tmp_path: Path) -> None:
     (tmp_path / "map.json").write_text('{"schema": 1, "kind": "tiles", "tiles": [{"file": "../secret.ply"}]}')
     with pytest.raises(InputError, match="lists no tiles"):
-        read_tiles(tmp_path)
+        map_of(tmp_path)

@@ -42,6 +42,7 @@ def test_a_page_of_another_version_is_shown_by_itself_and_said(
 ) -> None:
     old = shell().replace(script_of(RUN).digest, "sha256-other")
     folder = written(tmp_path / "run", old)
+    (folder / "trajectory.tum").touch()
     answer = page_of(folder)
     assert answer.body.decode() == old
     assert dict(answer.headers)["Content-Security-Policy"] == "sandbox allow-scripts allow-downloads"
@@ -52,6 +53,7 @@ def test_a_page_of_another_version_is_shown_by_itself_and_said(
 
 
 def test_a_run_without_a_page_is_said(tmp_path: Path) -> None:
+    (tmp_path / "trajectory.tum").touch()
     with pytest.raises(InputError, match=r"has no report\.html: make one with lslam graph"):
         require_page(tmp_path)
     with pytest.raises(InputError, match=r"report\.html"):

@@ -6,7 +6,6 @@ import logging
 import mmap
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
 from pathlib import Path
 from tokenize import TokenError
 from typing import Any
@@ -37,7 +36,6 @@ LARGE_M, COARSE_M = 1e5, 0.01
 _FEW = 8
 _COLOURS = ("red", "green", "blue")
 log = logging.getLogger("lslam")
-COLOURING = ("red", "green", "blue", "class")
 
 
 def read_points(path: Path, record: PointRecord | None = None) -> PointCloud:
@@ -271,20 +269,23 @@ def read_cloud(path: Path) -> ArrayCloud:
 def open_map(path: Path, attributes: Collection[str]) -> Cloud:
     """Open a map that lslam wrote, with the columns of its points, in the coordinates of the file, m.
 
-    attributes : of its points, as its note names them. LAS and LAZ are read block by block, PLY and PCD whole.
-    Raises InputError naming the file when it is missing, damaged or of another kind.
+    attributes : of its points, as its note names them. Of PLY, LAS and LAZ no more is held than a block; PCD is read whole.
+    Raises InputError naming the file when it is missing, damaged or of another kind, of LAS while its blocks are read.
     """
-    if path.suffix.lower() in (".las", ".laz"):
+    suffix = path.suffix.lower()
+    if suffix in (".las", ".laz"):
         return open_las(path, attributes)
-    fields = _read_columns(path)
-    cloud = cloud_from_fields(path, fields, np.float64)
-    columns = {name: fields[name] for name in (*attributes, *_COLOURS) if name in fields and name != "time"}
-    if "time" in attributes and "time" in fields:
-        columns[TIME_NS] = np.rint(1e9 * fields["time"]).astype(np.int64)
+    if suffix != ".ply":
+        fields = dict(_read_columns(path))
+    else:
+        with input_errors(path, ValueError, as_what="a map"), path.open("rb") as stream:
+            fields = ply_columns(path, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ))
+    if missing := [axis for axis in AXES if axis not in fields]:
+        raise InputError(f"{path}: no field {', '.join(missing)}; the file has {', '.join(fields) or 'no fields'}")
     if "rgb" in fields:
         pack = np.ascontiguousarray(fields["rgb"]).view(np.uint32)
-        columns |= {name: (pack >> shift).astype(np.uint8) for name, shift in zip(_COLOURS, (16, 8, 0), strict=True)}
-    return ArrayCloud(cloud.points, cloud.intensity, columns)
+        fields |= {name: (pack >> shift).astype(np.uint8) for name, shift in zip(_COLOURS, (16, 8, 0), strict=True)}
+    return ColumnCloud(fields, attributes)
 
 
 def coordinate_step(points: Floats) -> float:
@@ -301,11 +302,16 @@ def coordinate_step(points: Floats) -> float:
 
 
 class ColumnCloud:
-    """A cloud of named columns (N,), which may be mapped from a file: `x`, `y`, `z`, `intensity` and those of `COLOURING`."""
+    """A cloud of named columns (N,), which may be mapped from a file: `x`, `y`, `z`, `intensity`, colours and attributes."""
 
-    def __init__(self, columns: Mapping[str, NDArray[Any]]) -> None:
+    def __init__(self, columns: Mapping[str, NDArray[Any]], attributes: Collection[str]) -> None:
         self._columns = columns
-        self.column_types = {name: columns[name].dtype for name in COLOURING if name in columns}
+        # Times are seconds in the file.
+        self._names = {
+            TIME_NS if name == "time" else name: name for name in (*attributes, *_COLOURS) if name in columns
+        }
+        types = {name: columns[own].dtype.newbyteorder("=") for name, own in self._names.items()}
+        self.column_types = types | ({TIME_NS: np.dtype(np.int64)} if TIME_NS in types else {})
 
     def __len__(self) -> int:
         return len(self._columns["x"])
@@ -318,50 +324,43 @@ class ColumnCloud:
     def blocks(self) -> Iterator[CloudBlock]:
         """All points, as arrays of their own."""
         for begin in range(0, len(self), BLOCK):
-            part = {name: np.array(column[begin : begin + BLOCK]) for name, column in self._columns.items()}
-            points = np.column_stack([part[axis].astype(np.float64) for axis in "xyz"])
+            part = {name: column[begin : begin + BLOCK] for name, column in self._columns.items()}
+            points = np.column_stack([part[axis].astype(np.float64) for axis in AXES])
             intensity = part["intensity"].astype(np.float32) if self.has_intensity else None
-            yield CloudBlock(points, intensity, {name: part[name] for name in self.column_types})
+            values = {
+                name: np.rint(1e9 * part[own]) if name == TIME_NS else part[own] for name, own in self._names.items()
+            }
+            yield CloudBlock(points, intensity, {name: v.astype(self.column_types[name]) for name, v in values.items()})
 
 
 class MapCloud:
-    """One map of one or several files of a kind, in the world that `to_world` takes their points (N, 3), m, to."""
+    """One map of one or several files of a kind, of which one is open at a time; raises as `open_map`.
 
-    def __init__(self, paths: Sequence[Path], to_world: Callable[[Floats], Floats] = lambda points: points) -> None:
-        self._paths, self._to_world = paths, to_world
+    attributes : of its points; to_world : takes points (N, 3) of the files, m, to those of the cloud
+    """
 
-    @cached_property
-    def _parts(self) -> list[Cloud]:
-        return [stored_cloud(path) for path in self._paths]
+    def __init__(
+        self, paths: Sequence[Path], attributes: Collection[str], to_world: Callable[[Floats], Floats]
+    ) -> None:
+        self._paths, self._attributes, self._to_world = paths, attributes, to_world
+        self._size, self.has_intensity = 0, True
+        known: list[Mapping[str, np.dtype[Any]]] = []
+        for part in self._parts():
+            self._size += len(part)
+            self.has_intensity &= part.has_intensity
+            known.append(part.column_types)
+        self.column_types = {name: kind for name, kind in known[0].items() if all(name in one for one in known)}
 
-    @property
-    def has_intensity(self) -> bool:
-        """Whether all files have intensities."""
-        return all(part.has_intensity for part in self._parts)
-
-    @property
-    def column_types(self) -> Mapping[str, np.dtype[Any]]:
-        """Types of the columns that all files have."""
-        known = [part.column_types for part in self._parts]
-        return {name: kind for name, kind in known[0].items() if all(name in one for one in known)}
+    def _parts(self) -> Iterator[Cloud]:
+        return (open_map(path, self._attributes) for path in self._paths)
 
     def __len__(self) -> int:
-        return sum(map(len, self._parts))
+        return self._size
 
     def blocks(self) -> Iterator[CloudBlock]:
         """The blocks of one file after the other."""
-        for part in self._parts:
+        for part in self._parts():
             for block in part.blocks():
-                yield CloudBlock(self._to_world(block.points), block.intensity, block.columns)
-
-
-def stored_cloud(path: Path) -> Cloud:
-    """A map as lslam writes it. Of PLY, LAS and LAZ no more is held than a block; PCD is read whole.
-
-    Raises InputError naming the file when it is missing, damaged or of another kind, of LAS while its blocks are read.
-    """
-    if path.suffix.lower() != ".ply":
-        return open_map(path, ("class",))
-    with input_errors(path, ValueError, as_what="a map"), path.open("rb") as stream:
-        columns = ply_columns(path, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ))
-    return ColumnCloud(columns)
+                columns = {name: block.columns[name] for name in self.column_types}
+                intensity = block.intensity if self.has_intensity else None
+                yield CloudBlock(self._to_world(block.points), intensity, columns)

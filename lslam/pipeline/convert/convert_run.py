@@ -14,14 +14,13 @@ from lslam.core.errors import InputError, UsageError
 from lslam.core.kernels.voxel import first_points
 from lslam.core.types.arrays import Floats
 from lslam.core.types.sequence import Sequence
-from lslam.io.formats.point_files import read_cloud
 from lslam.maps.clean import PosedScan
 from lslam.odometry.frontend.register_scans import read_ahead
 from lslam.pipeline.convert import check_beside, check_output, stage
 from lslam.pipeline.convert.bag_writer import MAP_TOPIC, PATH_TOPIC, BagWriter
-from lslam.pipeline.map_files import in_own_world
 from lslam.pipeline.map_pass import scan_poser
-from lslam.pipeline.rebuild import EarlierRun, covariances_of, map_of, results_of
+from lslam.pipeline.rebuild import EarlierRun, covariances_of, results_of
+from lslam.pipeline.stored_map import map_of
 
 log = logging.getLogger("lslam")
 
@@ -124,13 +123,13 @@ def _scans_by_pose(run: EarlierRun, scans: Sequence | None) -> Iterator[PosedSca
 def _write_map(writer: BagWriter, run: EarlierRun, stamp: int) -> int:
     """Write the map in the world of the poses. Returns its number of points; 0, with a log message, without a map."""
     try:
-        path = map_of(run.folder)
+        stored = map_of(run.folder)
     except InputError as error:
         log.warning("%s", error)
         return 0
-    cloud = in_own_world(path, read_cloud(path))[0]
+    cloud = stored.read()
     if len(cloud) > MOST_MAP_POINTS:
-        log.info("%s: %d of its %d points are written", path, MOST_MAP_POINTS, len(cloud))
+        log.info("%s: %d of its %d points are written", stored.path, MOST_MAP_POINTS, len(cloud))
     some = _indices(len(cloud), MOST_MAP_POINTS)
     intensity = None if cloud.intensity is None else cloud.intensity[some]
     writer.write(MAP_TOPIC, stamp, writer.messages.points(stamp, cloud.points[some], intensity, WORLD))

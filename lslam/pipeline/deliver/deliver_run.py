@@ -41,8 +41,8 @@ from lslam.pipeline.deliver.survey import (
     precision_note,
     readme,
 )
-from lslam.pipeline.map_files import georeference_of, note_of
-from lslam.pipeline.rebuild import EarlierRun, map_of, results_of
+from lslam.pipeline.rebuild import EarlierRun, results_of
+from lslam.pipeline.stored_map import map_of
 from lslam.reports.plans import SurveySheet, survey_pdf
 from lslam.reports.png import density_grey
 
@@ -114,27 +114,19 @@ def deliver(
     return Delivery(out, {**files, README: "this survey in words"}, accuracy(survey), notes)
 
 
-def _voxel(survey: Survey) -> float:
-    """Edge of the voxels of the run's map, m; 0 for every point."""
-    return float(note_of(map_of(survey.folder)).get("voxel") or 0.0)
-
-
 def _write_map(folder: Path, survey: Survey) -> tuple[dict[str, str], list[str]]:
     """Write map.laz in the delivered coordinates. Returns what it is, and what it lacks."""
     try:
-        path = map_of(survey.folder)
+        stored = map_of(survey.folder)
     except InputError:
         way = f"the run was made without one; `lslam map {survey.folder}` builds it"
         return {}, [f"There is no map, and no plan from above: {way}, and then deliver again."]
-    note = note_of(path)
-    attributes = dict(note.get("attributes") or {})
-    cloud = open_map(path, attributes)
-    own = georeference_of(note.get("georeference")) if note.get("crs") else None
-    local = cloud if own is None else ProjectedCloud(cloud, Projection(own).invert)
-    write_las(folder / MAP, ProjectedCloud(local, survey.frame.apply), survey.frame.wkt)
+    attributes = dict(stored.note.get("attributes") or {})
+    cloud = stored.cloud(attributes)
+    write_las(folder / MAP, ProjectedCloud(cloud, survey.frame.apply), survey.frame.wkt)
     columns = ["intensity", *(name for name in attributes if name != "time")]
     columns += ["colour"] if "red" in cloud.column_types else []
-    voxel = f"one in each voxel of {_voxel(survey):g} m" if _voxel(survey) else "every point of every scan"
+    voxel = f"one in each voxel of {stored.voxel:g} m" if stored.voxel else "every point of every scan"
     about = f"{count_of(len(cloud), 'point')}, {voxel}; with {', '.join(columns)}"
     if "time" in attributes:
         is_unix = is_unix_time(int(next(iter(survey.drives.values())).trajectory.stamps_ns[0]))
@@ -153,7 +145,7 @@ def _write_plan(folder: Path, survey: Survey, files: dict[str, str]) -> tuple[ND
         places = np.concatenate([survey.frame.apply(run.trajectory.positions)[:, :2] for run in survey.drives.values()])
         (x, y), (east, north) = places.min(axis=0) - _PAPER_M, places.max(axis=0) + _PAPER_M
         return None, (float(x), float(east), float(y), float(north))
-    view = top_view(open_map(folder / MAP, ()), pixel_size(_voxel(survey), _PIXEL_M), _LONGEST)
+    view = top_view(open_map(folder / MAP, ()), pixel_size(map_of(survey.folder).voxel, _PIXEL_M), _LONGEST)
     image, (west, east, _, north) = density_grey(view.image), view.extent
     size = (east - west) / image.shape[1]
     write_geotiff(folder / PLAN, image, np.array([[size, 0, west], [0, -size, north]]), survey.frame.epsg, _EMPTY)

@@ -25,6 +25,7 @@ from lslam.io.formats.text_tables import utc_of
 from lslam.io.formats.trajectory_files import read_trajectory
 from lslam.maps.georeference import LocalFrame, Projection, in_crs
 from lslam.pipeline.map_files import georeference_of, read_json
+from lslam.pipeline.merge_runs import sessions_of
 from lslam.pipeline.rebuild import EarlierRun, covariances_of, read_run, results_of
 from lslam.pipeline.run_folder import MANIFEST, SESSIONS, require_run
 
@@ -158,15 +159,12 @@ def read_survey(folder: Path, crs: OutputCrs | None, check: Path | None = None, 
 
 
 def _drives(folder: Path, manifest: Mapping[str, Any]) -> dict[str, EarlierRun]:
-    if manifest.get("kind") != "merge":
+    sessions = sessions_of(folder)
+    if sessions is None:
         run = read_run(folder)
         return {run.name: run}
     georeference, drives = georeference_of(manifest.get("georeference")), {}
-    try:
-        sessions = [(str(row["name"]), Path(row["run"])) for row in manifest["sessions"]]
-    except MISFIT as error:
-        raise InputError(f"{folder / MANIFEST}: sessions: {error}; merge the runs again") from None
-    for name, source in sessions:
+    for name, source in sessions.items():
         if not source.is_dir():
             raise InputError(f"{folder} was merged from {source}, which is gone: put it back, or merge the runs again")
         run, trajectory = read_run(source), read_trajectory(folder / SESSIONS / f"{name}.tum", "tum")

@@ -12,8 +12,9 @@ import sys
 import tempfile
 import threading
 from collections import deque
+from collections.abc import Sequence
 from contextvars import copy_context
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -37,13 +38,13 @@ from lslam.core.types.cloud import thin_out
 from lslam.core.types.trajectory import Trajectory
 from lslam.core.untrusted import parse_json
 from lslam.io.formats.point_files import MapCloud
-from lslam.maps.georeference import Projection
+from lslam.io.formats.trajectory_files import read_trajectory
 from lslam.maps.octree import points_of, write_octree
-from lslam.pipeline.map_files import georeference_of, note_of, read_json
-from lslam.pipeline.map_tiles import INDEX, is_tiles
-from lslam.pipeline.rebuild import map_of, read_run
+from lslam.pipeline.merge_runs import sessions_of
+from lslam.pipeline.rebuild import read_run
 from lslam.pipeline.resume import listing_digest
-from lslam.pipeline.run_folder import MANIFEST, require_odometry
+from lslam.pipeline.run_folder import SESSIONS, require_odometry
+from lslam.pipeline.stored_map import map_of
 from lslam.pipeline.view.corrections import Corrections
 from lslam.pipeline.view.server import Answer, RunServer, Site
 from lslam.reports.page_data import pack
@@ -54,6 +55,7 @@ log = logging.getLogger("lslam")
 REPORT, TRAJECTORY = "report.html", "trajectory.tum"
 TALKS = "connect-src 'self'"
 SERVED = '<script type="application/json" id="served">{}</script>\n'  # tells the page's script
+MERGE_REFUSAL = "is a merge, whose loops cannot be corrected: correct its runs with lslam view, and merge them again"
 MOST_LINES = 30  # lines of the child that are kept
 PATIENCE_S = 20.0  # for a child that was asked to stop
 # Of the nodes and of their index; raise VERSION when either means something else. Octrees that are kept, the last used ones.
@@ -73,28 +75,28 @@ class ViewedSites:
         self._lock = threading.Lock()
 
     def add(self, folder: Path) -> int:
-        """Serve a run. Returns its number. Raises InputError for what is none."""
-        corrections, number = Corrections(folder), len(self._server.sites)
-        tiles = MapTiles(folder.resolve(), corrections.run.trajectory.positions)
+        """Serve a run, or a merge of several. Returns its number. Raises InputError for what is none."""
+        number, gets = len(self._server.sites), dict[str, Any]()
+        posts: dict[str, Any] = dict.fromkeys(("api/edits", "api/graph"), partial(_refuse, folder))
+        if (names := sessions_of(folder)) is not None:
+            tracks = [read_trajectory(folder / SESSIONS / f"{name}.tum", "tum").positions for name in names]
+        else:
+            corrections = Corrections(folder)
+            tracks = [corrections.run.trajectory.positions]
+            gets = {
+                "api/edits": corrections.edits,
+                "api/pair": corrections.pair,
+                "api/graph": lambda words: self._state(number),
+            }
+            posts = {
+                "api/edits": corrections.save,
+                "api/graph": lambda document: self._begin(corrections, number),
+                "api/stop": lambda document: self._end(number),
+            }
+        tiles = MapTiles(folder.resolve(), tracks)
         self._tiles.append(tiles)
-        self._server.sites.append(
-            Site(
-                folder,
-                lambda: page_of(folder),
-                gets={
-                    "api/edits": corrections.edits,
-                    "api/pair": corrections.pair,
-                    "api/graph": lambda words: self._state(number),
-                    "tiles/tree.json": tiles.tree,
-                },
-                posts={
-                    "api/edits": corrections.save,
-                    "api/graph": lambda document: self._begin(corrections, number),
-                    "api/stop": lambda document: self._end(number),
-                },
-                node=tiles.node,
-            )
-        )
+        gets["tiles/tree.json"] = tiles.tree
+        self._server.sites.append(Site(folder, lambda: page_of(folder), gets, posts, tiles.node))
         tiles.start()
         return number
 
@@ -168,30 +170,30 @@ def is_ours(text: str) -> bool:
     return policy(script_of(RUN)) in text
 
 
-def require_one_run(folder: Path) -> None:
-    """Raise InputError for the folder of a merge, or of a run that ended without a pose: there is nothing to correct."""
-    if read_json(folder / MANIFEST).get("kind") == "merge":
-        raise InputError(
-            f"{folder} is a merge of several runs: open {folder / REPORT} in a browser, or name one of its runs"
-        )
-    if not (folder / TRAJECTORY).is_file():
+def require_page(folder: Path) -> None:
+    """Raise InputError where nothing can be shown; say so where the page is of another version, or cannot be corrected."""
+    is_merge = sessions_of(folder) is not None
+    if not (is_merge or (folder / TRAJECTORY).is_file()):
         raise InputError(
             f"{folder} has no {TRAJECTORY}: the run ended before it had a pose, so there is nothing to show"
         )
-
-
-def require_page(folder: Path) -> None:
-    """Raise InputError where a run has no report; say so where it is of another version."""
+    way = "lslam merge" if is_merge else f"lslam graph {folder}"
     if not (folder / REPORT).is_file():
-        raise InputError(f"{folder} has no {REPORT}: make one with lslam graph {folder}")
+        raise InputError(f"{folder} has no {REPORT}: make one with {way}")
     with input_errors(folder / REPORT):
         text = (folder / REPORT).read_text(encoding="utf-8", errors="replace")
     if not is_ours(text):
         log.warning(
-            "%s is of another version of lslam: it is shown without tiles and corrections; lslam graph %s makes a new one",
+            "%s is of another version of lslam: it is shown without tiles and corrections; %s makes a new one",
             folder / REPORT,
-            folder,
+            way,
         )
+    elif is_merge:
+        log.info("%s %s", folder, MERGE_REFUSAL)
+
+
+def _refuse(folder: Path, document: Any) -> None:
+    raise UsageError(f"{folder} {MERGE_REFUSAL}")
 
 
 def _page(text: str, rules: str) -> Answer:
@@ -266,11 +268,11 @@ def next_folder(run: Path) -> Path:
 class MapTiles:
     """The octree of a run's map. `start` finds or builds it in a thread, `stop` ends that.
 
-    positions : (N, 3) m, of the trajectory; each point of a tile knows the nearest
+    tracks : (N, 3) m, positions of each trajectory; a point of a tile knows the nearest pose of one, or the nearest of several
     """
 
-    def __init__(self, run: Path, positions: Floats) -> None:
-        self._run, self._positions = run, positions
+    def __init__(self, run: Path, tracks: Sequence[Floats]) -> None:
+        self._run, self._tracks = run, tracks
         self._tree: dict[str, Any] = {}
         self._folder = Path()
         self._said: dict[str, Any] = {"share": 0.0}
@@ -294,7 +296,7 @@ class MapTiles:
         return {**self._tree, "nodes": {name: count for name, (_, count) in self._tree["nodes"].items()}}
 
     def node(self, name: str) -> bytes | None:
-        """A node as `write_octree` has it, and behind it the number of the nearest pose of each point, uint32."""
+        """A node as `write_octree` has it, and behind it the nearest pose, or trajectory, of each point, uint32."""
         begin, count = self._tree.get("nodes", {}).get(name, (0, 0))
         if not count:
             return None
@@ -303,21 +305,24 @@ class MapTiles:
             stream.seek(begin)
             data = stream.read(count * size)
         points = points_of(name, data[: 6 * count], self._tree)
-        return data + self._nearest.query(points)[1].astype("<u4").tobytes()
+        nearest = self._nearest.query(points)[1]
+        if len(self._tracks) > 1:
+            nearest = np.searchsorted(np.cumsum([len(track) for track in self._tracks]), nearest, side="right")
+        return data + nearest.astype("<u4").tobytes()
 
     @cached_property
     def _nearest(self) -> cKDTree:
-        return cKDTree(np.nan_to_num(self._positions, nan=1e12))
+        return cKDTree(np.nan_to_num(np.concatenate(self._tracks), nan=1e12))
 
     def _build(self) -> None:
         try:
-            cloud, digest = _map_of(self._run)
+            stored = map_of(self._run)
             base = cache_folder("octrees")
             if base is None:
                 raise OutputError("tiles need a folder: name one of your own in XDG_CACHE_HOME")
-            folder = base / digest
+            folder = base / f"{VERSION}-{listing_digest(stored.path)}"
             if not (folder / TREE).is_file():
-                self._write(folder, cloud)
+                self._write(folder, stored.cloud(("class",)))
             tree = parse_json((folder / TREE).read_text(encoding="utf-8"))
             os.utime(folder)
             _forget(base, folder)
@@ -343,22 +348,6 @@ class MapTiles:
         if self._is_over.is_set():
             raise InterruptedRunError("interrupted while tiles were built")
         self._said = {"share": share}
-
-
-def _map_of(run: Path) -> tuple[MapCloud, str]:
-    """The map of a run, or its tiles, in its world, and a digest of the files. Raises InputError without one."""
-    try:
-        paths = [map_of(run)]
-        note = note_of(paths[0])
-    except InputError:
-        folder = run / "tiles"
-        if not is_tiles(folder):
-            raise
-        note = read_json(folder / INDEX)
-        paths = [folder / Path(str(tile["file"])).name for tile in note["tiles"]]
-    place = georeference_of(note.get("georeference"))
-    cloud = MapCloud(paths) if note.get("crs") is None or place is None else MapCloud(paths, Projection(place).invert)
-    return cloud, f"{VERSION}-{listing_digest(paths[0] if len(paths) == 1 else paths[0].parent)}"
 
 
 def _forget(base: Path, own: Path) -> None:

@@ -48,17 +48,17 @@ export function nodesFor(tree, camera, budget, finest) {
   return found;
 }
 
-/** A node as a cloud that is coloured as the page's `like`: its bytes are points, columns, and the nearest pose of each. */
+/** A node as a cloud that is coloured as the page's `like`: its bytes are points, columns, and the nearest pose, or session, of each. */
 export function nodeOf(name, buffer, tree, like) {
   const { low, edge } = cubeOf(name, tree);
   const count = tree.nodes[name];
-  const cloud = { low, step: [0, 1, 2].map(() => edge / 65535), count, points: new Int16Array(buffer, 0, 3 * count) };
+  const cloud = { low, step: [0, 1, 2].map(() => edge / 65535), count, height: like.height, points: new Int16Array(buffer, 0, 3 * count) };
   let at = 6 * count;
   for (const [column, size] of Object.entries(tree.columns)) {
     cloud[column] = new Uint8Array(buffer, at, size * count);
     at += size * count;
   }
-  cloud.nearest = new Uint32Array(buffer.slice(at));
+  cloud[like.session ? "session" : "nearest"] = new Uint32Array(buffer.slice(at));
   if (cloud.intensity && like.values) {
     const [[a, b], [c, d]] = [tree.values, like.values];
     const table = Uint8ClampedArray.from({ length: 256 }, (_, k) => (255 * (a + (k / 255) * (b - a) - c)) / (d - c));

@@ -1,7 +1,6 @@
 // More points of the map from the server: nodes of its octree, as fine as the view needs them.
-import { BY, colourings } from "./colours.mjs";
+import { BY } from "./colours.mjs";
 import { nodeOf, nodesFor } from "./octree.mjs";
-import { scans } from "./scans.mjs";
 import { ask, askBytes, served } from "./served.mjs";
 import { mapView } from "./view.mjs";
 
@@ -106,7 +105,7 @@ export class Tiles {
 
   /** The cloud as the drawer takes it, in the map's way of colours. */
   coloured(cloud) {
-    const way = colourings(cloud, scans)[this.view.way_of_colour];
+    const way = this.view.waysOf(cloud)[this.view.way_of_colour];
     if (this.view.by === BY.rgb) return { ...cloud, rgb: way?.bytes || new Uint8Array(3 * cloud.count).fill(128) };
     return { ...cloud, rgb: null, value: way?.bytes || new Uint8Array(cloud.count) };
   }

@@ -40,8 +40,7 @@ export class MapView {
     this.drawer.add("map", this.cloud);
     this.spacing = data.spacing; // m between the points that are drawn
     this.names = ["map"]; // clouds that are drawn
-    const colourOf = ({ style }) => getComputedStyle(figure.querySelector(`.legend .${style}`)).color;
-    this.known = { ...kindsOf(this.cloud, sessions?.sessions, colourOf), ...colourings(this.cloud, scans) };
+    this.known = this.waysOf(this.cloud);
     this.camera = new Camera();
     [this.size, this.isShaded, this.share] = [1, true, Math.min(1, FIRST / this.cloud.count)];
     [this.painters, this.liners, this.leavers] = [[], [], []];
@@ -91,6 +90,12 @@ export class MapView {
     make("path", { class: `line ${style}`, d: "M0 6H26" }, line);
     item.append(name);
     this.figure.querySelector(".legend").append(item);
+  }
+
+  /** Ways to colour the points of a cloud of the map, by name. */
+  waysOf(cloud) {
+    const colourOf = ({ style }) => getComputedStyle(this.figure.querySelector(`.legend .${style}`)).color;
+    return { ...kindsOf(cloud, sessions?.sessions, colourOf), ...colourings(cloud, scans) };
   }
 
   /** Colour the points by one of the ways that are known, over its usual range. */

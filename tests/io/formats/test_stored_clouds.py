@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import resource
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from lslam.core.errors import InputError
 from lslam.core.types.cloud import BLOCK, ArrayCloud, in_memory
-from lslam.io.formats.point_files import MapCloud, stored_cloud, write_cloud
+from lslam.io.formats.point_files import MapCloud, open_map, write_cloud
 
 
 def coloured(count: int = 1000) -> ArrayCloud:
@@ -25,7 +26,7 @@ def coloured(count: int = 1000) -> ArrayCloud:
 def test_a_map_comes_back(tmp_path: Path, name: str) -> None:
     cloud = coloured()
     write_cloud(tmp_path / name, cloud)
-    stored = stored_cloud(tmp_path / name)
+    stored = open_map(tmp_path / name, ("class",))
     read = in_memory(stored)
     assert (len(stored), stored.has_intensity) == (len(cloud), True)
     _, own = cKDTree(cloud.points).query(read.points)  # COPC has them in an order of its own
@@ -42,7 +43,7 @@ def test_several_files_are_one_map_in_the_world(tmp_path: Path) -> None:
         cloud = cloud if k else ArrayCloud(cloud.points, cloud.intensity)
         write_cloud(tmp_path / f"tile_{k}_0.ply", cloud)
         paths.append(tmp_path / f"tile_{k}_0.ply")
-    both = MapCloud(paths, lambda points: points + 100)
+    both = MapCloud(paths, ("class",), lambda points: points + 100)
     read = in_memory(both)
     assert (len(both), len(read), dict(both.column_types)) == (21, 21, {}), "columns that one lacks are left out"
     np.testing.assert_allclose(read.points[:10], coloured(10).points + 100, atol=1e-5)
@@ -51,11 +52,28 @@ def test_several_files_are_one_map_in_the_world(tmp_path: Path) -> None:
 def test_blocks_of_a_ply_are_read_when_they_are_asked_for(tmp_path: Path) -> None:
     write_cloud(tmp_path / "map.ply", ArrayCloud.of(np.random.default_rng(0).uniform(0, 1, (3 * BLOCK, 3))))
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    blocks = stored_cloud(tmp_path / "map.ply").blocks()
+    blocks = open_map(tmp_path / "map.ply", ()).blocks()
     first = next(blocks)
     assert len(first) == BLOCK
     assert first.points.base is None or first.points.flags.owndata
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 60_000
+
+
+def test_of_many_files_one_is_held(tmp_path: Path) -> None:
+    """Nor is one open: a map may have more tiles than a process may have files."""
+    paths = [tmp_path / f"tile_{k}_0.ply" for k in range(40)]
+    for path in paths:
+        write_cloud(path, ArrayCloud.of(np.random.default_rng(0).uniform(0, 1, (50_000, 3))))
+    before = len(list(Path("/proc/self/fd").iterdir()))
+    tracemalloc.start()
+    cloud, count = MapCloud(paths, (), lambda points: points), 0
+    for block in cloud.blocks():
+        count += len(block)
+        assert len(list(Path("/proc/self/fd").iterdir())) <= before + 2
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert count == len(cloud) == 40 * 50_000
+    assert peak < 5 * 50_000 * 3 * 8
 
 
 def test_damage_is_named(tmp_path: Path) -> None:
@@ -63,4 +81,4 @@ def test_damage_is_named(tmp_path: Path) -> None:
     (tmp_path / "other.ply").write_text("nothing")
     for name in ("empty.ply", "other.ply", "none.ply", "none.laz"):
         with pytest.raises(InputError, match=name):
-            stored_cloud(tmp_path / name)
+            open_map(tmp_path / name, ())
