@@ -31,9 +31,9 @@ CAMERA_TO_LIDAR = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]
 
 
 def with_drift(results: Sequence[ScanResult], config: DebugConfig, tilt_deg_per_100m: float = 0.0) -> list[ScanResult]:
-    """The results with drift over the distance travelled; covariances are rotated with the poses, and not enlarged.
+    """The results with the drift of `debug.drift` added to their poses; covariances are rotated with them, and not enlarged.
 
-    tilt_deg_per_100m : of roll and pitch, as `drift_deg_per_100m` of heading
+    tilt_deg_per_100m : added drift of roll and pitch, in place of `drift_deg_per_100m`, which is of the heading
     """
     poses = np.stack([r.T_world_lidar for r in results])
     steps = se3.relative(poses[:-1], poses[1:])
@@ -61,7 +61,7 @@ def with_drift(results: Sequence[ScanResult], config: DebugConfig, tilt_deg_per_
 
 
 def _courses(way: Floats, config: DebugConfig) -> tuple[Floats, Floats]:
-    """(N, 3) where positions drift to and (N,) how the heading turns over steps of `way` (N,) m, of unit size (rms)."""
+    """Direction (N, 3) of the position drift and sign (N,) of the heading drift for steps of `way` (N,) m, of unit size (rms)."""
     rng = np.random.default_rng(config.drift_seed)
     direction = rng.normal(size=3)
     direction /= np.linalg.norm(direction)
@@ -83,7 +83,7 @@ def _courses(way: Floats, config: DebugConfig) -> tuple[Floats, Floats]:
 
 
 def recorded_errors(estimate: str, truth: str) -> tuple[Floats, Floats]:
-    """Of a real run: m travelled (K,), from 0, and the error added up until there, (K, 6) twists in LiDAR axes.
+    """Distance travelled (K,), m, in a recorded run, and its accumulated odometry error there, (K, 6) twists in LiDAR axes.
 
     Raises InputError when a file cannot be read, the two do not belong together, or nothing moves.
     """
@@ -100,7 +100,7 @@ def recorded_errors(estimate: str, truth: str) -> tuple[Floats, Floats]:
 
 
 def errors_over(way: Floats, nodes: Floats, errors: Floats) -> Floats:
-    """(N, 4, 4) errors of steps of `way` (N,) m: what was added up until `nodes` (K,) m, begun anew where that ends."""
+    """Pose errors (N, 4, 4) of steps of `way` (N,) m; `errors` (K, 6), accumulated at `nodes` (K,) m, repeat periodically."""
     ends = np.append(0.0, np.cumsum(way))
     rounds, at = np.divmod(ends, nodes[-1])
     # Places where the sensor stood have one way and several errors: the last one counts.
@@ -118,7 +118,7 @@ def moved_keyframes(keyframes: Sequence[Keyframe], results: Sequence[ScanResult]
 
 
 def describe(config: DebugConfig) -> str:
-    """For the manifest and the log."""
+    """Sentence about the added drift, for the manifest and the log."""
     if config.drift_kind == "recorded":
         return (
             f"debug.drift: odometry was made to err as {config.drift_estimate} does against {config.drift_truth}; this run is "
@@ -135,6 +135,7 @@ def describe(config: DebugConfig) -> str:
 
 
 def _move(results: Sequence[ScanResult], poses: Floats) -> list[ScanResult]:
+    """The results at `poses` (N, 4, 4), with their covariances rotated likewise."""
     turns = so3.normalise(poses[:, :3, :3] @ np.stack([r.T_world_lidar[:3, :3].T for r in results]))
 
     def rotate(covariance: Floats | None, R: Floats) -> Floats | None:

@@ -70,7 +70,7 @@ class SweptPoints:
 
     @classmethod
     def at_times(cls, points: Floats, times: Floats, stamps: Floats) -> SweptPoints:
-        """Points (N, 3) measured at `times` (N,), s, by a sensor whose poses have the `stamps` (K,), s, which rise."""
+        """Points (N, 3) measured at `times` (N,), s, by a sensor whose poses have the ascending `stamps` (K,), s."""
         order = np.argsort(times, kind="stable")
         points, times = points[order], times[order]
         at = np.clip(np.searchsorted(stamps, times, side="right") - 1, 0, len(stamps) - 1)
@@ -105,10 +105,10 @@ class Adjustment:
 def adjust(
     poses: Floats, sweep: SweptPoints, mask: Bools, prior: PosePrior | None = None, numbers: Longs = NO_NUMBERS
 ) -> Adjustment:
-    """Correct the `poses` (K, 4, 4) for the planes in the `mask` (N,) part of the points; the rest moves with them.
+    """Correct the `poses` (K, 4, 4) so that points on common planes get thinner; only points of the `mask` (N,) are used.
 
-    prior : what else is known of some poses, of which these are the `numbers`, -1 for none
-    Where nothing holds the run as a whole, the mean correction is about zero.
+    prior : information about some poses; numbers : (K,) their indices in it, -1 for poses without
+    All points move with the poses. Without a prior that fixes the run as a whole, the mean correction is about zero.
     """
     rounds = 0
     for level in LEVELS:
@@ -141,10 +141,10 @@ def _move_poses(poses: Floats, places: SweptPoints, knots: Floats, corrections: 
 
 @dataclass(frozen=True)
 class _KnotPrior:
-    """What is known of some poses, in terms of the corrections of the two knots round each.
+    """A pose prior in terms of the corrections of the two knots about each pose.
 
-    knots : (2, K) their numbers, J : (2, K, 6, 6) effect of their corrections; changes : (K, 6) of the poses so far
-    which : (K,) numbers of these poses among those of `of_poses`
+    knots : (2, K) their indices, J : (2, K, 6, 6) effect of their corrections; changes : (K, 6) of the poses so far
+    which : (K,) indices of these poses among those of `of_poses`
     """
 
     of_poses: PosePrior
@@ -168,6 +168,7 @@ class _KnotPrior:
         return out
 
     def _back(self, changes: Floats, count: int) -> Floats:
+        """Gradient (count, 6) at the knots for pose `changes` (K, 6), through the prior's information and J transposed."""
         everywhere = np.zeros((len(self.of_poses.poses), 6))
         everywhere[self.which] = changes
         force = self.of_poses.product(everywhere)[self.which]
@@ -177,7 +178,7 @@ class _KnotPrior:
 
 
 def _knot_prior(prior: PosePrior, numbers: Longs, poses: Floats, places: SweptPoints, knots: Floats) -> _KnotPrior:
-    """The prior by what is known of the poses with `numbers` (-1 for none), which now lie at `places` between the `knots`."""
+    """The prior on the poses with `numbers` >= 0, at `places`, as a prior on the corrections of the `knots` (M, 4, 4)."""
     which = np.flatnonzero(numbers >= 0)
     own = numbers[which]
     at = np.stack([places.poses[own], np.minimum(places.poses[own] + 1, len(knots) - 1)])
@@ -191,7 +192,10 @@ def _knot_prior(prior: PosePrior, numbers: Longs, poses: Floats, places: SweptPo
 def _corrections(
     poses: Floats, sweep: SweptPoints, level: AdjustmentLevel, total: Floats, prior: _KnotPrior | None
 ) -> Floats | None:
-    """(K, 6) corrections of one Gauss-Newton step; None without planes."""
+    """(K, 6) corrections of one Gauss-Newton step, solved by conjugate gradients; None when no plane is found.
+
+    total : (K, 6) corrections so far, for the smoothness term; prior : information about some poses
+    """
     planes = find_planes(sweep.points, sweep.poses, level.flatness)
     on_plane = planes >= 0
     if not on_plane.any():
@@ -247,9 +251,10 @@ def _conjugate_gradients(product: Callable[[Floats], Floats], right: Floats, pre
 
 
 def find_planes(points: Floats, poses: Longs, flatness: float) -> Longs:
-    """(N,) number of the plane that each point (N, 3) lies on, -1 for none; poses : (N,) of the scans that saw them, rising.
+    """(N,) index of the plane that each point (N, 3) lies on, -1 for none; poses : (N,) ascending numbers of their scans.
 
     A plane is the largest voxel whose points are flat, seen by several scans, and spread in two directions.
+    flatness : largest ratio of the smallest to the middle eigenvalue of their covariance
     """
     planes, count = np.full(len(points), -1, np.int64), 0
     left = np.arange(len(points))

@@ -45,11 +45,12 @@ def with_control(
     up: Floats | None,
     config: Config,
 ) -> Placement:
-    """The placement with the control points as held fixes; where there is none, they give it.
+    """The placement with the control points as fixes that are never rejected; without a georeference, they define it.
 
-    results : at the poses of odometry; up : (3,) up in their world as an IMU has it, None for how the sensor is mounted
+    results : at odometry's poses; up : (3,) up in odometry's world by an IMU, None for that of the sensor's mounting
+    Returns the placement with a `problem` when the points do not determine a heading.
 
-    Raises UsageError for coordinates that PROJ does not know or that are none of a place.
+    Raises UsageError for coordinates that PROJ rejects or that lie nowhere on the Earth.
     """
     survey = _Survey(points, results, config.gnss.geoid)
     on_earth, own = survey.on_earth, survey.own
@@ -109,9 +110,9 @@ def against_odometry(
     probability: float,
     geoid: str = "",
 ) -> list[str]:
-    """One sentence for each pair of successive points that are not so far apart as odometry may have them.
+    """One sentence for each pair of successive points whose distance differs from odometry's by more than it may drift.
 
-    Distances need no heading. A trajectory that holds the points bends to a wrong one without a residual: odometry alone tells.
+    Distances need no heading. A trajectory bends to a wrong point without a residual, so only odometry reveals the error.
     """
     if len(points) < 2 or len(keyframes) < 2:
         return []
@@ -141,7 +142,7 @@ def control_positions(points: Many[ControlPoint], results: Many[ScanResult], geo
 
 
 def control_facts(residuals: Many[ControlResidual]) -> dict[str, float]:
-    """For the manifest."""
+    """Number, rms (m) and largest normalised residual of the control points, for the manifest."""
     off = np.stack([one.residual for one in residuals])
     return {
         "count": len(residuals),
@@ -152,7 +153,7 @@ def control_facts(residuals: Many[ControlResidual]) -> dict[str, float]:
 
 
 def contradicting(residuals: Many[ControlResidual], probability: float) -> list[str]:
-    """One sentence for each point that the others and odometry contradict: a held one bends the trajectory to it all the same."""
+    """One sentence for each control point whose residual after the solution is significant; the point stays in use."""
     limit = float(np.sqrt(quantile(probability, 3)))
     wrong = sorted((one for one in residuals if one.size > limit), key=lambda one: -one.size)
     texts = [
@@ -183,7 +184,7 @@ class _Survey:
 
 
 def _align_level(own: Floats, enu: Floats, sigmas: Floats) -> Floats | None:
-    """(4, 4) by heading and place, least squares of points (N, 3) of a level world; None where they leave the heading vague."""
+    """Least-squares heading and translation (4, 4) from level points `own` to `enu` (N, 3); None where the heading is vague."""
     weights = 1.0 / sigmas[:, 0] ** 2
     weights /= weights.sum()
     a, b = (points - weights @ points for points in (own, enu))
@@ -195,7 +196,7 @@ def _align_level(own: Floats, enu: Floats, sigmas: Floats) -> Floats | None:
 
 
 def _in_crs(georeference: Georeference, points: Many[ControlPoint], config: Config) -> Georeference:
-    """What the outputs are written in: as configured, else as the points are given where that is a plane in metres."""
+    """The georeference with the CRS of the outputs: the configured one, else that of the points if it is a projection in metres."""
     crs, height_crs, geoid = config.gnss.crs, config.gnss.height_crs, config.gnss.geoid
     configured = replace(georeference, epsg=crs, height_epsg=height_crs, geoid=geoid)
     codes = {(point.epsg, point.height_epsg) for point in points}
@@ -217,7 +218,10 @@ def place_keyframes(
     results: list[ScanResult],
     config: Config,
 ) -> list[Keyframe]:
-    """The keyframes where odometry, known pairs and control points put them: further loop closures are searched from there."""
+    """The keyframes at the poses that odometry, known pairs and control points imply; loop search starts from these.
+
+    Unchanged where there are neither pairs nor points, or where the graph of these cannot be solved.
+    """
     loops = [c.constraint for c in pairs if c.is_accepted and c.constraint is not None]
     if len(keyframes) < 2 or not (loops or points):
         return keyframes
@@ -244,7 +248,7 @@ def doubts(
     results: list[ScanResult],
     config: Config,
 ) -> list[str]:
-    """A sentence for each known pair that does not register, and for each that odometry contradicts, which holds all the same."""
+    """One sentence for each known pair that fails to register, and for each that odometry contradicts but that stays in use."""
     texts = [
         f"{pair.source}: the scans of the known pair do not close a loop: {candidate.reason}"
         for pair, candidate in zip(pairs, candidates, strict=True)
@@ -267,6 +271,7 @@ def doubts(
 def _graph_of(
     keyframes: list[Keyframe], loops: list[Constraint], results: list[ScanResult], config: Config
 ) -> PoseGraph:
+    """Pose graph of odometry and `loops` alone."""
     return PoseGraph(
         poses=np.stack([k.T_world_lidar for k in keyframes]),
         odometry=odometry_constraints(keyframes, results, config.graph, None),

@@ -134,7 +134,7 @@ def with_actual_sigmas(
 
 
 def _kinds(sigmas: Floats) -> list[Bools]:
-    """Which of the fixes state alike, by their sigmas (F,): a receiver says one thing of a fixed solution, another of a float."""
+    """Masks (F,) of fixes with similar stated sigmas (F,): receivers state other sigmas for fixed than for float solutions."""
     ordered = np.sort(sigmas)
     edges, begin = [], 0
     for at in (np.flatnonzero(ordered[1:] > SIGMA_RATIO * ordered[:-1]) + 1).tolist():
@@ -148,7 +148,7 @@ def _kinds(sigmas: Floats) -> list[Bools]:
 def align_fixes(
     fixes: Fixes, up: Floats, up_sigma: float, min_fixes: int, faults: Faults
 ) -> tuple[GnssAlignment | None, Fixes, Faults]:
-    """The alignment, and the fixes without the heights that are of another datum than most: east and north stay."""
+    """The alignment, and the fixes with the heights of a deviating datum removed; east and north of these remain."""
 
     def fit(of: Fixes) -> GnssAlignment | None:
         return align(of.antenna, of.positions, of.sigmas, of.slack, up, up_sigma, min_fixes)
@@ -274,7 +274,10 @@ def _fits(T: Floats, a: Floats, fixes: Floats, sigmas: Floats) -> Bools:
 
 
 def fit_pose(T: Floats, a: Floats, fixes: Floats, sigmas: Floats, up_sigma: float) -> Floats:
-    """Least squares over all six degrees of freedom, with the up direction as prior on the tilt."""
+    """Robust least squares, from T (4, 4), of the pose that maps `a` (F, 3) to `fixes` (F, 3), with sigmas (F, 3), m.
+
+    up_sigma : rad, sigma of the prior that the axis z of `a` is vertical
+    """
     from scipy.optimize import least_squares
 
     centre = a.mean(0)

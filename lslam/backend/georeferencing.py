@@ -108,9 +108,9 @@ def place(
     graph: PoseGraph,
     config: Config,
 ) -> Placement:
-    """Fit the run's trajectory to its fixes.
+    """Fit the run's trajectory to its fixes: the placement with georeference and position factors, or with the `problem`.
 
-    up : (3,) up in the world of the trajectory as an IMU has it, or None; graph : of the keyframes, without the fixes
+    up : (3,) up in the world of the trajectory by an IMU, or None; graph : of the keyframes, without the fixes
     """
     stream = sequence.gnss
     assert stream is not None
@@ -180,7 +180,7 @@ def _antenna(sequence: Sequence) -> Floats:
 def _on_one_clock(
     stream: GnssStream, results: Many[ScanResult], arm: Floats, level: Floats, config: Config
 ) -> tuple[Fixes | str, Faults]:
-    """As `_usable`, with the stamps set right where they are clearly late or early."""
+    """The usable fixes, or the reason for too few, after correction of a significant clock offset; with the faults found."""
     fixes = _usable(stream, results, arm, config.gnss, config.graph)
     if isinstance(fixes, str):
         return fixes, Faults()
@@ -198,7 +198,7 @@ def _on_one_clock(
 def _usable(
     stream: GnssStream, results: Many[ScanResult], arm: Floats, config: GnssConfig, drift: GraphConfig
 ) -> Fixes | str:
-    """The fixes taken during the run that have a position and a small enough sigma; or why there are too few."""
+    """The fixes of the run with a position and a sigma of at most `gnss.max_sigma`; or a sentence why there are too few."""
     stamps = np.array([r.stamp_ns for r in results], np.int64)
     stated = np.full(len(stream), config.sigma) if config.sigma is not None else stream.sigma
     stated = np.maximum(np.where(np.isfinite(stated) & (stated > 0), stated, USUAL_SIGMA_M), MIN_SIGMA_M)
@@ -248,7 +248,7 @@ def _at_first(alignment: GnssAlignment, fixes: Fixes, config: GnssConfig) -> tup
 
 
 def _elsewhere(alignment: GnssAlignment) -> str:
-    """A sentence about fixes in another part of the world, or nothing."""
+    """A sentence about fixes more than `ELSEWHERE` m from the others; empty without such fixes."""
     away = int((np.linalg.norm(alignment.residuals, axis=1) > ELSEWHERE).sum())
     if not away:
         return ""
@@ -342,7 +342,10 @@ def _as_factors(
     keyframes: Many[Keyframe],
     fix_noise: GaussMarkovNoise | None,
 ) -> tuple[PositionFix, ...]:
-    """Position factors, each from the keyframe before the fix; gross outliers are left out."""
+    """Position factors, each on the keyframe before its fix; gross outliers are omitted.
+
+    shift : (4, 4) from the frame of the fixes to that of the georeference
+    """
     near = np.linalg.norm(alignment.residuals / np.hypot(fixes.sigmas, fixes.slack[:, None]), axis=1) < ABSURD
     owners = _owners(fixes, keyframes)
     positions = se3.apply(shift, fixes.positions)

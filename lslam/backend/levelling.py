@@ -53,7 +53,10 @@ class Level:
 
 
 def find_level(sequence: Sequence, results: list[ScanResult], config: Config) -> Level:
-    """The level that `input.level` asks for: by gravity from an IMU, by the ground under the first scan, or none."""
+    """The level that `input.level` configures: by gravity from an IMU, by the ground under the first scan, or none.
+
+    Its `problem` says why a configured level is unavailable. A tilt within the sigma of gravity is not corrected.
+    """
     mode = config.input.level
     if mode == "auto":
         mode = "gravity" if config.imu.use else "none"
@@ -89,9 +92,9 @@ def level_results(results: list[ScanResult], level: Level) -> list[ScanResult]:
 
 
 def _up_by_gravity(results: list[ScanResult]) -> tuple[Floats | None, float]:
-    """Mean over the run weighted by sigmas: bias and tilt become observable only in bends.
+    """Up (3,) in the run's world and its sigma, rad: the mean over the run, weighted by sigmas; None without gravity.
 
-    Its sigma, rad, is that of the best measurement, since their errors are correlated.
+    Bias and tilt become observable only in bends. The sigma is that of the best measurement, since errors are correlated.
     """
     up = np.zeros(3)
     results = [r for r in results if not r.frame]
@@ -104,7 +107,7 @@ def _up_by_gravity(results: list[ScanResult]) -> tuple[Floats | None, float]:
 
 
 def _up_by_ground(sequence: Sequence, results: list[ScanResult], config: Config) -> Floats | None:
-    """The dominant plane below the first scan that was registered."""
+    """Up (3,) in the run's world: the normal of the ground plane under the first registered scan; None without a plane."""
     for number, result in enumerate(results):
         if result.status != "ok" or result.frame:
             continue
@@ -128,7 +131,7 @@ MOST = 0.8
 
 
 def up_directions(keyframes: Many[Keyframe], results: Many[ScanResult], config: GraphConfig) -> list[UpDirection]:
-    """One per keyframe with a direction of gravity; those within the correlation time count as one measurement."""
+    """Measured up directions, one per keyframe that has gravity; those within the correlation time share one measurement."""
     gravities = [(k, g) for k in keyframes if (g := results[k.scan].imu.gravity) is not None]
     stamps = np.array([k.stamp_ns for k, _ in gravities], np.int64)
     half = round(0.5e9 * MEMORY_S)
@@ -152,7 +155,7 @@ def world_up(ups: Many[UpDirection], keyframes: Many[Keyframe]) -> Floats | None
 
 
 def floor_planes(store: KeyframeStore, config: GraphConfig, up: Floats = Z, world_up: Floats = Z) -> list[FloorPlane]:
-    """The floor plane under each keyframe that is level and as far below as usual.
+    """The floor plane under each keyframe, where it is level and its distance is close to the median.
 
     up : (3,) unit vector up in the LiDAR frame; world_up : (3,) that in the world of the keyframes
     """
@@ -168,7 +171,7 @@ def floor_planes(store: KeyframeStore, config: GraphConfig, up: Floats = Z, worl
 
 
 def on_one_plane(floors: Many[FloorPlane], poses: Floats, distances: Floats, config: GraphConfig) -> list[FloorPlane]:
-    """The floors consistent with the one that has the most support; none where so few are that the ground is not flat.
+    """The floors that agree with the one of largest support, up to odometry's drift; none where too few agree: no flat ground.
 
     poses : (K, 4, 4) of the keyframes by odometry, with the drift of `config`; distances : (K,) m travelled
     """

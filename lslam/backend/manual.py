@@ -35,7 +35,7 @@ X, Y, Z = ("x", "easting", "east", "lon", "longitude"), ("y", "northing", "north
 
 @dataclass(frozen=True)
 class _Row:
-    """One line of a table: its cells by column, and where it stands."""
+    """One line of a table: its cells by column, its file and line number."""
 
     path: Path
     line: int
@@ -54,7 +54,7 @@ class _Row:
         return next((self.cells[name] for name in names if self.cells.get(name)), "")
 
     def number(self, *names: str) -> float | None:
-        """Its finite number; None where it is empty. Raises InputError."""
+        """The finite number in the first non-empty of the columns `names`; None where they are empty. Raises InputError."""
         text = self.text(*names)
         if not text:
             return None
@@ -81,7 +81,7 @@ class _Row:
         return value
 
     def instant(self, suffix: str = "") -> Instant:
-        """A scan's number, or a stamp, s or ns."""
+        """The scan by number, or its stamp in s or ns, of the columns with `suffix`; raises InputError when they are empty."""
         scan, seconds, ns = (self.text(name + suffix) for name in ("scan", "stamp", "stamp_ns"))
         if scan:
             number = whole_number(scan)
@@ -96,8 +96,8 @@ class _Row:
 def read_named_pairs(path: Path) -> list[NamedPair]:
     """Pairs by `scan_a` and `scan_b`, or `stamp_a` and `stamp_b`, s, whose `verdict` is known or forbidden.
 
-    `x_m`, `y_m` : where the second is seen from the first, roughly; `within_m` : how far from there at most. Rows with a run's
-    own verdict are passed over. Raises InputError naming file and line.
+    `x_m`, `y_m` : approximate position of the second in the frame of the first; `within_m` : largest distance from it. Rows with
+    a run's own verdict are skipped. Raises InputError naming file and line.
     """
     pairs = []
     for row in _rows(path, (("scan_a", "stamp_a", "stamp_ns_a"), ("scan_b", "stamp_b", "stamp_ns_b"), ("verdict",))):
@@ -117,8 +117,8 @@ def read_named_pairs(path: Path) -> list[NamedPair]:
 def read_control_points(path: Path) -> list[ControlPoint]:
     """Points by `scan` or `stamp`, s, with `x`, `y`, `z`, `sigma`, m, and `crs`, as EPSG:25832.
 
-    `sigma_z` : of the height where it is another; `lidar_x`, `lidar_y`, `lidar_z` : the point as the LiDAR saw it, m, where it
-    is not the sensor itself. Raises InputError naming file and line.
+    `sigma_z` : of the height, if different; `lidar_x`, `lidar_y`, `lidar_z` : the point in the LiDAR frame, m, if it is not the
+    sensor itself. Raises InputError naming file and line.
     """
     points = []
     for row in _rows(path, (("scan", "stamp", "stamp_ns"), X, Y, Z, ("sigma", "sigma_m"), ("crs",))):
@@ -144,7 +144,7 @@ def read_control_points(path: Path) -> list[ControlPoint]:
 
 
 def write_control(path: Path, residuals: Iterable[ControlResidual]) -> None:
-    """What is left of each control point, m, east, north and up, surveyed minus solved; raises OutputError."""
+    """Write the residual of each control point, surveyed minus solved, m, east, north and up, as CSV; raises OutputError."""
     rows = ["point,stamp_ns,east_m,north_m,up_m,sigma_m,sigma_up_m,sigmas,lat_deg,lon_deg,height_m"]
     for one in residuals:
         (east, north, up), (sigma, _, sigma_up) = one.residual.tolist(), one.point.sigma.tolist()
@@ -208,7 +208,7 @@ class KeyframePairs:
 
 
 def read_manual(config: Config, sequence: Sequence) -> Manual:
-    """The files that `loops.file` and `graph.control` name; raises InputError, also for what the sequence does not have.
+    """The files that `loops.file` and `graph.control` name. Raises InputError, also for scans that the sequence lacks.
 
     Raises UsageError for coordinates that PROJ does not know.
     """
@@ -250,7 +250,7 @@ def stamp_of(instant: Instant, results: Many[ScanResult]) -> int:
 
 
 def keyframe_pairs(pairs: Many[NamedPair], results: Many[ScanResult], keyframes: Many[Keyframe]) -> KeyframePairs:
-    """The pairs by their nearest keyframes; a sentence for each whose scans share one, which is no pair."""
+    """The pairs by their nearest keyframes, and a sentence for each pair whose two scans have the same nearest keyframe."""
     stamps = np.array([k.stamp_ns for k in keyframes])
     found = KeyframePairs([], [])
     for pair in pairs:
@@ -279,7 +279,10 @@ def keyframe_pairs(pairs: Many[NamedPair], results: Many[ScanResult], keyframes:
 def _keyframe_pair(
     pair: NamedPair, ends: list[tuple[int, int]], results: Many[ScanResult], keyframes: Many[Keyframe]
 ) -> KnownPair:
-    """The keyframes lie beside the scans, as odometry has it."""
+    """The pair of keyframes nearest to the two scans; odometry moves the expected position from the scans to these.
+
+    ends : keyframe number and stamp, ns, of both scans
+    """
     (first, at_first), (second, at_second) = ends
     stamps = np.array([r.stamp_ns for r in results])
     poses = np.stack([r.T_world_lidar for r in results])

@@ -72,7 +72,7 @@ def run_back_end(
 ) -> BackEnd:
     """Optimise the pose graph with loop closures, fixes and map priors, and correct all scans; odometry's poses on failure.
 
-    points : control points, which hold
+    hold : solves with a map of buildings instead, None without one; points : control points, which are never rejected
     """
     keyframes = store.keyframes
     clocks = KeyframeClocks() if clocks is None else clocks
@@ -117,7 +117,10 @@ def run_back_end(
 def _with_residuals(
     out: BackEnd, georeference: Georeference, sequence: Sequence, drift: Drift, inputs: BackEndInput, is_level: bool
 ) -> BackEnd:
-    """The outcome with what is left of the control points; what contradicts them is one of the problems."""
+    """The outcome with the control points' residuals; contradictions become `problems` of `inputs`.
+
+    drift : odometry's uncertainty; is_level : whether an IMU measures the vertical
+    """
     config, points, results = inputs.config, inputs.points, inputs.results
     geoid = config.gnss.geoid
     residuals = control_residuals(points, out.results, georeference, geoid)
@@ -133,7 +136,7 @@ def _with_residuals(
 
 
 def _compared_with_map(out: BackEnd, graph: PoseGraph, inputs: BackEndInput) -> BackEnd:
-    """The outcome, its thickness of planes beside that without fixes and control points, where such hold the poses."""
+    """The outcome with the thickness of planes with and without fixes and control points; a significant growth is a problem."""
     config, place = inputs.config, out.georeference
     if place is None or place.method not in ("graph", "control") or out.solution is None:
         return out
@@ -177,7 +180,7 @@ def _without_one(graph: PoseGraph, without: Floats, inputs: BackEndInput) -> str
 def _place(
     sequence: Sequence, graph: PoseGraph, inputs: BackEndInput, modes: tuple[str, ...] = ("graph",)
 ) -> Placement:
-    """By fixes, when they are used in one of the `modes`, and by control points; empty without both."""
+    """Placement by fixes, when `gnss.mode` is one of the `modes`, and by control points; empty without both."""
     placement = _by_fixes(sequence, graph, inputs) if inputs.config.gnss.mode in modes else Placement()
     if not inputs.points:
         return placement
@@ -233,6 +236,7 @@ def _fitness(store: KeyframeStore, a: int, b: int, T_a_b: Floats) -> float:
 
 
 def _graph(inputs: BackEndInput, inertial: InertialChain | None) -> PoseGraph:
+    """The pose graph of a run before fixes: odometry, accepted loops, gravity, floors and the IMU's chain."""
     store, config, results, candidates = inputs.store, inputs.config, inputs.results, inputs.candidates
     loops = [c.constraint for c in candidates if c.is_accepted and c.constraint is not None]
     fitness = None
@@ -294,9 +298,9 @@ class Thickening:
 
 
 def thickening(store: KeyframeStore, without: Floats, final: Floats) -> Thickening | None:
-    """What the `final` poses (K, 4, 4) do to planes of the keyframes' points at the poses `without` (K, 4, 4).
+    """Change of the planes' thickness by the `final` poses (K, 4, 4) against the poses `without` (K, 4, 4); None without planes.
 
-    The same neighbourhoods are compared. Those of one part of the drive err together, so that parts give the noise.
+    The same neighbourhoods are compared. Errors within a part of the drive are correlated, so that parts give the noise.
     """
     (before, owner), (after, _) = (_plane_variances(store, poses) for poses in (without, final))
     both = np.isfinite(before) & np.isfinite(after)
@@ -311,7 +315,7 @@ def thickening(store: KeyframeStore, without: Floats, final: Floats) -> Thickeni
 
 
 def thicker_map(change: Thickening | None, held_by: str, probability: float) -> tuple[str, dict[str, Any]]:
-    """A sentence where planes are clearly thicker with what holds the poses than without; and both, m."""
+    """A sentence where planes are significantly thicker with `held_by` than without, else empty; and both thicknesses, m."""
     if change is None:
         return "", {}
     facts = {"planes_without_m": round(change.before, 4), "planes_m": round(change.after, 4)}
@@ -335,7 +339,7 @@ def _plane_variances(store: KeyframeStore, poses: Floats) -> tuple[Floats, NDArr
 
 
 def fixes_against_points(fixes: Fixes, points: Many[ControlPoint], georeference: Georeference) -> str:
-    """A sentence where the fixes lie elsewhere than the control points have put the run, horizontally or in height.
+    """A sentence where the fixes deviate from the run as the control points place it, horizontally or in height, else empty.
 
     fixes : with the antenna in the world of the final poses
     """
@@ -364,10 +368,10 @@ def fixes_against_points(fixes: Fixes, points: Many[ControlPoint], georeference:
 
 
 def redundancy(survey: Floats, run: Floats, is_level: bool) -> tuple[str, dict[str, Any]]:
-    """A sentence about points that nothing checks: two, with the scale between them and odometry, or the heights of three.
+    """A sentence about control points without redundancy (two, or the heights of three), and facts for the manifest.
 
     survey, run : (N, 3) m, of the points by their survey and by odometry
-    is_level : whether something else tells what is up
+    is_level : whether an IMU measures the vertical
     """
     if len(survey) == 3 and not is_level:
         text = "the heights of three have no redundancy where no IMU tells what is up: a wrong one tilts the drive"

@@ -157,7 +157,7 @@ def without_steady_drift(graph: PoseGraph, inputs: BackEndInput) -> PoseGraph:
 
 
 def keep_odometry(inputs: BackEndInput) -> BackEnd:
-    """The run as odometry has it; accepted loop closures are rejected with the graph."""
+    """The run at odometry's poses, for a graph without a solution; accepted loop closures become rejected."""
     candidates = [
         replace(c, verdict=Verdict.REJECTED, stage=LoopStage.GRAPH, reason="the pose graph could not be solved")
         if c.is_accepted
@@ -190,7 +190,7 @@ def apply_verdicts(
 
 
 def _rescore(georeference: Georeference, graph: PoseGraph, solution: Solution) -> Georeference:
-    """The georeference with the residuals of the graph's inliers, of the kind that gave it; unchanged without any."""
+    """The georeference with new residuals: those of the inlier fixes or walls in the solved graph; unchanged without any."""
     is_control = georeference.method == "control"
     used = [
         fix
@@ -241,6 +241,7 @@ def _noise_facts(fix_noise: GaussMarkovNoise) -> dict[str, Any]:
 
 
 def _drift_facts(drift: EstimatedDrift) -> dict[str, Any]:
+    """Estimated rates of drift with sigmas (percent, deg per 100 m) and their significance, for the manifest."""
     names = _OF_WALLS if len(drift.rates) == len(_OF_WALLS) else _OF_LOOPS
     units = np.array([100.0 if name.endswith("percent") else np.degrees(100.0) for name in names])
     columns = {"estimate": drift.rates, "sigma": drift.sigma} | ({} if drift.rms is None else {"rms": drift.rms})
@@ -253,7 +254,7 @@ def _drift_facts(drift: EstimatedDrift) -> dict[str, Any]:
 
 
 def view_loop(record: RunRecord, back_end: BackEnd, store: KeyframeStore) -> LoopView | None:
-    """The view; None without an accepted loop closure or an optimised graph."""
+    """Poses and scans about the loop closure of largest correction, for the report; None without one, or without a solution."""
     closed = [c for c in record.loops if c.is_accepted]
     if record.odometry is None or not back_end.is_optimised or not closed:
         return None

@@ -50,9 +50,9 @@ FAR = 1.0  # m; points farther from their nearest one do not count in the fitnes
 def lay(
     graph: PoseGraph, solution: Solution, matches: OsmMatches, extract: BuildingExtract, inputs: BackEndInput
 ) -> BuildingFit:
-    """For each keyframe: NDT of the scan with all buildings near, VGICP of each building, an edge to each, optimisation.
+    """For each keyframe: NDT of the scan with all buildings in range, VGICP of each building, an edge to each, optimisation.
 
-    As `corrections.Lay`, without using `matches` of walls; the loops and fixes that the solution rejected are left out.
+    The signature is that of `corrections.Lay`. `matches` is not used; loops and fixes that `solution` rejected are omitted.
     """
     store, config, clocks = inputs.store, inputs.config, inputs.clocks
     osm = OsmMap(extract.buildings)
@@ -79,7 +79,10 @@ def lay(
 def _match(
     number: int, store: KeyframeStore, pose: Floats, osm: OsmMap, config: Config, clock: StageClock
 ) -> tuple[KeyframeMatch, list[BuildingMatch]]:
-    """Match the scan of a keyframe, its points above the horizon projected to the ground, with the buildings near."""
+    """Match the scan of a keyframe, projected to the ground without its points below the horizon, with the buildings in range.
+
+    pose : (4, 4), map frame. Returns the sighting, whose kind is `none` when NDT does not converge, and the building matches.
+    """
     at = se2.of_se3(pose)
     tilt = se2.to_se3(np.array([0.0, 0.0, -at[2]]))[:3, :3] @ pose[:3, :3]
     with clock.stage("walls"):
@@ -163,6 +166,7 @@ def lay_building(walls: Floats, scan: Floats, prior: Floats) -> FlatFit | None:
 def _align(
     source: Floats, target: Floats, prior: Floats, voxel: float, residual: Literal["ndt", "vgicp"]
 ) -> FlatFit | None:
+    """Pose of the points `source` (N, 2) in `target` (M, 2), m, registered from `prior` (3,); None for a poor overlap."""
     from scipy.spatial import cKDTree
 
     if min(len(source), len(target)) < LEAST_POINTS:

@@ -86,6 +86,7 @@ def read_buildings_geojson(path: Path) -> CorrectedMap:
 
 
 def _feature(correction: BuildingCorrection, origin: Floats, overlaps: list[str]) -> dict[str, Any]:
+    """GeoJSON feature of a corrected building; `overlaps` are the OpenStreetMap ids of the buildings that it overlaps."""
     building, (east, north, yaw) = correction.building, correction.displacement
     polygons = [
         [_positions(np.concatenate([ring, ring[:1]]), origin) for ring in footprint.rings]
@@ -114,6 +115,7 @@ def _feature(correction: BuildingCorrection, origin: Floats, overlaps: list[str]
 
 
 def _correction(feature: dict[str, Any], origin: Floats) -> BuildingCorrection:
+    """The correction that `_feature` wrote, in the frame of `origin` (3,) lat, lon, height; the building as it is on the map."""
     known, shape = feature["properties"], feature["geometry"]
     polygons = [shape["coordinates"]] if shape["type"] == "Polygon" else shape["coordinates"]
     rings = [[_metres(ring, origin)[:-1] for ring in polygon] for polygon in polygons]
@@ -153,9 +155,9 @@ def corrected_osm(data: OsmData, corrected_map: CorrectedMap) -> OsmData:
     """The buildings of `corrected_map` with all their nodes, moved, as an extract to open in an editor (JOSM).
 
     Nodes and ways keep their numbers and versions; those that differ from `data` are `edits`. A node that several
-    buildings share and that they no longer agree on stays with the one known best; the others get new nodes, with numbers
-    below zero. A building of `data` that is not in `corrected_map` holds its nodes where they are. What the run found absent
-    is not deleted: it is for a mapper to decide.
+    buildings share and displace differently stays with the building of highest confidence; the others get new nodes, with
+    negative numbers. A node that a building outside `corrected_map` uses is not moved. Absent buildings are not deleted: a
+    mapper decides.
     """
     owners = {_element(c.building): c for c in corrected_map.buildings}
     result = OsmData(attribution=corrected_map.attribution)
@@ -191,7 +193,7 @@ class _NodeTarget:
 
 
 def _wishes(data: OsmData, ways: list[int], correction: BuildingCorrection, origin: Floats) -> list[_NodeTarget]:
-    """One for each node of a building."""
+    """Position (m, local frame of `origin`) to which the correction moves each node of the building's `ways`."""
     nodes = list(dict.fromkeys(node for number in ways for node in data.ways[number].nodes))
     rotation, shift = about(correction.building.middle, correction.displacement)
     was = to_local(np.array([(*data.nodes[node], 0.0) for node in nodes]).reshape(-1, 3), origin)[:, :2]
@@ -202,7 +204,7 @@ def _wishes(data: OsmData, ways: list[int], correction: BuildingCorrection, orig
 
 
 def _place(result: OsmData, wishes: dict[int, list[_NodeTarget]], origin: Floats) -> None:
-    """Move nodes to where they are wanted; part those that are wanted in several places."""
+    """Move the nodes of `result` to their targets; a node with targets in several places is split into new nodes."""
     fresh = iter(range(min([0, *result.nodes, *result.ways]) - 1, -(2**62), -1))
     for node, wanted in wishes.items():
         for group in _agreeing(sorted(wanted, key=lambda w: -w.confidence)):
@@ -221,7 +223,7 @@ def _place(result: OsmData, wishes: dict[int, list[_NodeTarget]], origin: Floats
 
 
 def _agreeing(wishes: list[_NodeTarget]) -> list[list[_NodeTarget]]:
-    """Wishes in groups that want one place, the best known first."""
+    """Groups of targets that lie within `ONE_NODE` m of the first target of the group."""
     groups: list[list[_NodeTarget]] = []
     for wish in wishes:
         near = [g for g in groups if np.linalg.norm(wish.place - g[0].place) <= ONE_NODE]

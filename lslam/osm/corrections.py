@@ -146,7 +146,7 @@ class _Line:
         self.keyframes = {keyframe}
 
     def takes(self, wall: Floats, keyframe: int) -> bool:
-        """Merge a wall that lies on the line, within `SEEN_WALL_M` of the segment; True then."""
+        """Merge the wall (2, 2), m, if it is collinear and within `SEEN_WALL_M` of the segment; returns whether it did."""
         away = wall - self._from
         s, d = away @ self._u, away @ [-self._u[1], self._u[0]]
         leaning = abs(d[1] - d[0]) > ONE_WAY * abs(s[1] - s[0])

@@ -156,7 +156,7 @@ def _up_by_ground(store: KeyframeStore, odometry: Floats, config: Config) -> Flo
 
 
 def _both_ways(run: LevelRun, osm: OsmMap, track: OsmTrack, clocks: KeyframeClocks) -> list[KeyframeMatch]:
-    """Forward from the first keyframe; then back from the first accepted match of full rank."""
+    """Matches of all keyframes: forward from the first; then backward from the first accepted match of full rank."""
     found = _along(range(len(run.store)), run, osm, track, clocks)
     numbers = [m.keyframe for m in found if m.is_accepted and m.rank == 3]
     if numbers and numbers[0] > 0:
@@ -175,7 +175,10 @@ def _along(
     clocks: KeyframeClocks,
     before: int | None = None,
 ) -> list[KeyframeMatch]:
-    """Match the keyframes `numbers` in turn. The track is at keyframe `before`, or at the first of them for None."""
+    """Match the keyframes `numbers` in turn, and update the track by each accepted match.
+
+    before : keyframe at whose pose the track is; None: the first of `numbers`
+    """
     config, planar = run.config, run.planar
     matches: list[KeyframeMatch] = []
     for number in checking(numbers):
@@ -195,7 +198,7 @@ def _along(
 
 
 def _gate(match: KeyframeMatch, track: OsmTrack, config: OsmConfig, graph: GraphConfig) -> KeyframeMatch:
-    """The match with its verdict."""
+    """The match, accepted or with the reason why the track rejects it: too few walls, or too far from its prediction."""
     if match.reason:
         return match
     if track.sigma[0] > LOST_RATIO * config.map_sigma and (match.rank < 3 or len(match.pairs) < START_WALLS):
@@ -243,6 +246,7 @@ def _lower(T: Floats, first: Floats, T_map_world: Floats | None) -> Floats:
 
 
 def _why_none(matches: list[KeyframeMatch], osm: OsmMap, extract: BuildingExtract) -> str:
+    """The warning for a run without an accepted match: buildings too far away, or the most frequent reason of rejection."""
     away = min(osm.distance(m.prior[:2]) for m in matches)
     if all(m.reason == "no building near" for m in matches):
         return (

@@ -206,7 +206,7 @@ def remove_overlaps(buildings: Sequence[Building], displacements: Floats, inform
     Parameters
     ----------
     displacements : (B, 3) x, y (m), yaw (rad) about each building's `middle`
-    information : (B, 3, 3) of these, 1/m2 and 1/rad2, positive definite: the weak prior included
+    information : (B, 3, 3) of these, 1/m2 and 1/rad2, positive definite
 
     Buildings without contacts keep their displacement exactly. Canopies, buildings that begin above the ground and those
     that overlap on the map by more than `NESTED_SHARE` are not separated.

@@ -71,9 +71,9 @@ def from_overpass(reply: Any) -> OsmData:
 
 
 def merge_replies(replies: Iterable[Any]) -> OsmData:
-    """One extract of many replies; what several hold is in it once.
+    """One extract of many Overpass replies, without duplicates.
 
-    Raises ValueError saying what is wrong with one; GaveUpError, which is such, when a server did.
+    Raises ValueError for an invalid reply; GaveUpError, a subclass, for one in which the server reports that it gave up.
     """
     data = OsmData()
     for reply in replies:
@@ -176,6 +176,7 @@ def _bounds_of(path: Path) -> Bounds | None:
 
 
 def _ask_patiently(bounds: Bounds, config: OsmConfig, folder: Path, sleep: Callable[[float], None]) -> OverpassReply:
+    """The reply to `bounds`, asked `config.attempts` times with growing pauses (s); raises InputError after the last one."""
     wait = BACKOFF_S
     # All threads and processes of this user together send one request at a time.
     with _one_thread_at_a_time, one_at_a_time(folder / "request.lock", "asks the map server"):
@@ -221,7 +222,7 @@ def _ask(bounds: Bounds, config: OsmConfig) -> OverpassReply:
 
 
 def _exchange(bounds: Bounds, config: OsmConfig, is_late: threading.Event) -> bytes:
-    """The body of a reply; raises InputError once `is_late` is set."""
+    """The body of the server's reply. Raises _TryAgainError for a broken connection or a busy server, else InputError."""
     import requests
 
     server = config.server
@@ -249,6 +250,7 @@ def _exchange(bounds: Bounds, config: OsmConfig, is_late: threading.Event) -> by
 
 
 def _check_status(reply: Any, server: str) -> None:
+    """Raise _TryAgainError for a busy server (with its `Retry-After`, s), InputError for any other status than 200."""
     status = reply.status_code
     if status in _BUSY:
         said = reply.headers.get("Retry-After", "")
@@ -287,6 +289,7 @@ def _too_late(server: str, limit: float) -> str:
 
 
 def _parse(body: bytes, bounds: Bounds, server: str) -> OverpassReply:
+    """The reply in `body`. Raises _TryAgainError where it is cut short or the server gave up, InputError where it is invalid."""
     if body[:64].lstrip()[:1] == b"<":
         raise InputError(f"{server} answered with a web page, not with data: check osm.server")
     try:
@@ -300,7 +303,10 @@ def _parse(body: bytes, bounds: Bounds, server: str) -> OverpassReply:
 
 
 def _check_place(reply: OverpassReply, bounds: Bounds, is_own: bool = True) -> OverpassReply:
-    """The reply; raises ValueError when it is invalid, or, for a reply to exactly `bounds`, about another place."""
+    """The reply. Raises ValueError when it is invalid, or when `is_own` and most of its nodes lie far outside `bounds`.
+
+    is_own : whether the request was for exactly `bounds`
+    """
     data = from_overpass(reply)
     places = np.array([*data.nodes.values()]).reshape(-1, 2)
     if is_own and bounds.share_inside(places, FAR_OUT) < 0.5:

@@ -172,6 +172,7 @@ class OsmBuffer:
             self._done.put(self._circle(request))
 
     def _circle(self, request: _RequestedCircle) -> _Circle:
+        """Fetch the buildings of one requested circle (in the thread); a failure becomes the `problem` of the result."""
         try:
             fix = from_local(np.array([[*request.centre, 0.0]]), self._origin)[:, :2]
             reply = OverpassReply.of(self._fetch(around(fix, request.radius)))
@@ -196,7 +197,7 @@ class OsmBuffer:
             circle.reply.write(stream, requested)
 
     def _load(self, folder: Path | None) -> None:
-        """Take the folder, and read the replies that an earlier run wrote there."""
+        """Remember `folder` for later replies, and read those that an earlier run wrote there."""
         self._folder = folder
         for path in [] if folder is None else sorted(folder.glob("*.json")):
             try:
@@ -213,6 +214,7 @@ class OsmBuffer:
             self._take(self._done.get())
 
     def _take(self, circle: _Circle) -> None:
+        """Close the request of `circle`; keep its reply, on disk too, or log its problem."""
         self._open = [request for request in self._open if request is not circle.request]
         if circle.problem is not None:
             self._answered.append(circle.request)
@@ -252,7 +254,7 @@ class OsmServer(OsmBuffer):
         self.ask(np.zeros(2))
 
     def see(self, stamp_ns: int, T_world_lidar: Floats) -> None:
-        """Request the buildings around the estimate, when they are not requested yet."""
+        """Request the buildings around a pose (4, 4) that odometry estimates, unless an earlier request covers them."""
         at = se2.of_se3(T_world_lidar)
         self._start = at if self._start is None else self._start
         step = se2.relative(self._start, at)

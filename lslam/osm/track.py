@@ -59,7 +59,7 @@ class OsmTrack:
         return float(error @ np.linalg.solve(S, error)), len(error)
 
     def take(self, pose: Floats, information: Floats) -> None:
-        """Update with a match."""
+        """Kalman update with a matched pose (3,), map frame, and its information (3, 3), which may be singular."""
         error, H, R = self._innovation(pose, information)
         gain = np.linalg.solve(H @ self.covariance @ H.T + R, H @ self.covariance).T
         moved = self.pose + gain @ error

@@ -67,9 +67,9 @@ class Sizes:
 
 
 class DriftFit:
-    """Least squares for start, shift of the map and rates at knots; the error of each wall on the map is marginalised.
+    """Least squares for start, shift of the map and drift rates at knots; the error of each wall of the map is marginalised.
 
-    effects : (K, 3, 5 + P) Jacobians of the planar poses; rates_before : (P,) by which the poses are corrected already
+    effects : (K, 3, 5 + P) Jacobians of the planar poses; rates_before : (P,) rates that the poses are corrected by already
     seen_sigma, map_sigma : m, of a sighting and of a wall on the map; prior_sigmas : (5,) m, rad, of start and shift
     """
 
@@ -240,7 +240,7 @@ def _fit_rates(
     before: WallDrift | None,
     is_varying: bool,
 ) -> WallDrift:
-    """As `find_wall_drift`, for constant or for varying rates alone."""
+    """The estimate of `find_wall_drift` under one hypothesis; `sigmas` are `seen_sigma` and `map_sigma`, m."""
     assert graph.start_sigma is not None
     length = float(graph.distances[-1])
     apart = min(max(KNOTS_APART_M, length / MOST), MEMORY_M) if is_varying else MEMORY_M
@@ -276,7 +276,7 @@ def _fit_rates(
 
 
 def _likeliest(fit: DriftFit, roots: Sequence[Floats]) -> Sizes:
-    """The hyperparameters of maximum likelihood."""
+    """The noise and drift hyperparameters of maximum likelihood; a later one of `roots` must be significantly better."""
     best, least = Sizes(SCALES[0], roots[0]), np.inf
     for root in checking(roots):
         found = np.array([fit.negative_log_likelihood(noise, root, SIZES) for noise in SCALES])

@@ -115,8 +115,8 @@ def find_heading(
 ) -> WallMatch | None:
     """Match the source with the target within `radius`, m, of `place` (2,) over all headings: the start without GNSS.
 
-    Returns None without a match, or when it has a free direction or fewer than `START_WALLS` pairs. A match of which another
-    pose is an alternative has `is_ambiguous` and must not be used.
+    source, target : walls (S, 2, 2), (T, 2, 2), m. Returns None without a match, for a match with a free direction, or with
+    fewer than `START_WALLS` pairs. A match with `is_ambiguous` has an equally good alternative and must not be used.
     """
     config = config or OsmConfig()
     # Without a heading the least coverage is larger, and the distance from the prior does not count.
@@ -172,7 +172,7 @@ class _WallSearch:
         return replace(best, pairs=pairs, is_ambiguous=_has_alternative(best, inside, self.config))
 
     def _within_reach(self, target: Floats) -> Longs:
-        """Numbers of the target walls within reach of the source."""
+        """Indices of the target walls (T, 4) that a source wall can reach from any pose of the window."""
         slack = float(np.hypot(self.window[0], self.window[1]))
         reach = min(float(np.abs(self.source).max(initial=0.0)) * np.sqrt(2), VISIBLE_M * 2) + slack + 5.0
         a, b = target[:, :2] - self.at[:2], target[:, 2:] - self.at[:2]
@@ -258,7 +258,7 @@ def _at_pose(planar: Floats, centre: Floats, pose: Floats) -> Floats:
 
 
 def _has_alternative(best: WallMatch, found: list[WallMatch], config: OsmConfig) -> bool:
-    """Whether a pose that differs along observed directions fits nearly as well."""
+    """Whether a pose of `found` that differs from `best` along observed directions fits nearly as well."""
     for other in found:
         if other.fitness < best.fitness - config.rival_margin:
             continue
@@ -284,7 +284,7 @@ def warm_up() -> None:
 
 
 def match_keyframe(view: KeyframeMatch, osm: OsmMap, config: OsmConfig) -> KeyframeMatch:
-    """Match `view`, walls with a prior pose and its sigma, with the buildings near. `reason` says why a match is rejected."""
+    """Match the walls of `view` with the buildings in range of its prior pose and sigma; `reason` says why a match is rejected."""
     if not len(view.walls):
         return replace(view, reason="no walls seen")
     reach = config.use_radius + SEARCH_SIGMAS * float(np.hypot(view.sigma[0], view.sigma[1]))
@@ -301,7 +301,7 @@ def match_keyframe(view: KeyframeMatch, osm: OsmMap, config: OsmConfig) -> Keyfr
 def match_buildings(
     match: KeyframeMatch, pose: Floats, shift: Floats, osm: OsmMap, config: OsmConfig
 ) -> list[BuildingMatch]:
-    """Match each building near with the walls seen from a keyframe at `pose` (3,), map frame.
+    """Match each building in range with the walls seen from a keyframe at `pose` (3,), map frame.
 
     shift : (2,) m, common shift of the map, by which the prior of every building is displaced
     """

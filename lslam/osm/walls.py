@@ -81,7 +81,7 @@ def find_walls(
 ) -> Walls:
     """Walls in the points (N, 3), m, of a scan or of a submap, in a frame whose z points up.
 
-    is_wall : (N,) which points may be of walls; the others tell where the ground is
+    is_wall : (N,) points that may be of walls; the others serve to find the ground
     views : (V, 2) or (V, 3) positions of the sensor, m, which direct the walls; the origin by default
     The same input gives the same result, which is empty without walls.
     """
@@ -229,7 +229,7 @@ POLE_WIDTH_M, LEAST_POLE_HEIGHT_M = 0.8, 1.2  # m; width of a pole in squares of
 
 
 def classify(points: NDArray[Any]) -> NDArray[np.uint16]:
-    """Classes (N,), as SemanticKITTI's numbers, of the points (N, 3), m, of a submap whose z points up; 0 where it cannot say."""
+    """SemanticKITTI classes (N,) of the points (N, 3), m, of a submap whose z points up; 0 for unclassified points."""
     cloud = np.asarray(points, np.float32).reshape(-1, 3)
     labels = np.full(len(cloud), _GROUND, np.uint16)
     height = _heights(cloud)
@@ -240,7 +240,7 @@ def classify(points: NDArray[Any]) -> NDArray[np.uint16]:
 
 
 def _heights(cloud: NDArray[np.float32]) -> Floats:
-    """(N,) m above the ground below each point."""
+    """Heights (N,), m, of the points (N, 3) above the ground below them."""
     if not len(cloud):
         return np.zeros(0)
     level, half = lowest_levels(cloud)
@@ -255,7 +255,7 @@ def _heights(cloud: NDArray[np.float32]) -> Floats:
 
 
 def _standing(points: Floats, height: Floats) -> NDArray[np.uint16]:
-    """Classes of points above the ground: by the shape of their cubes, then by what stands together."""
+    """SemanticKITTI classes of points above the ground: by the shape of their voxels, then by that of connected objects."""
     cells = np.floor(points / CUBE_M).astype(np.int64)
     keys, member = np.unique(_pack_cells(cells), return_inverse=True)
     is_flat, is_upright, is_rough = _shapes(points, keys, member)
@@ -279,7 +279,7 @@ def _standing(points: Floats, height: Floats) -> NDArray[np.uint16]:
 
 
 def _shapes(points: Floats, keys: Longs, member: Longs) -> tuple[Bools, Bools, Bools]:
-    """Whether the neighbourhood of each cube is a plane, whether that is upright, and whether it has points and is none."""
+    """For each voxel: is its neighbourhood a plane, is that plane vertical, and has it points but no plane."""
     relative = points - points.mean(0)
     moments = np.column_stack(
         [np.ones(len(points)), relative, *(relative[:, i] * relative[:, j] for i in range(3) for j in range(i, 3))]
@@ -303,7 +303,7 @@ def _shapes(points: Floats, keys: Longs, member: Longs) -> tuple[Bools, Bools, B
 
 
 def _things(cells: Longs) -> Longs:
-    """Number of the thing that each point is of, seen from above; `cells` (N, 3) of the points."""
+    """Index of the connected object that each point belongs to, seen from above; `cells` (N, 3) are the points' voxels."""
     from scipy import ndimage
 
     if not len(cells):
@@ -318,7 +318,7 @@ def _things(cells: Longs) -> Longs:
 def _by_size(
     points: Floats, height: Floats, things: Longs, labels: NDArray[np.uint16], is_flat: Bools
 ) -> NDArray[np.uint16]:
-    """Classes of the points of low things: vehicles and poles by their size, the rest as they are."""
+    """Classes of the points of low objects: vehicles and poles by their size, all others as in `labels`."""
     if not len(points):
         return labels
     count = np.bincount(things)

@@ -138,7 +138,7 @@ def _as_arrays(
 def _linear(
     count: int, owners: NDArray[np.intp], measurements: Floats, weights: Floats, map_prior: MapPrior
 ) -> tuple[Floats, Floats, Floats]:
-    """Displacements, covariances and shift by least squares; each building is eliminated, the shift is what is left."""
+    """Displacements (B, 3), covariances (B, 3, 3) and common shift (2,) by least squares, the buildings being eliminated first."""
     own = np.diag(1.0 / map_prior.sigma**2)
     normal, pull = np.tile(own, (count, 1, 1)), np.zeros((count, 3))
     np.add.at(normal, owners, weights)
@@ -181,7 +181,7 @@ def optimise_jointly(
     map_prior: MapPrior | None,
     config: GraphConfig,
 ) -> JointSolution:
-    """Poses of keyframes and displacements of the buildings with `middles` (B, 2), m, from everything at once.
+    """Poses of keyframes and displacements of the buildings with `middles` (B, 2), m, in one graph.
 
     Parameters
     ----------

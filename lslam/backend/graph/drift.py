@@ -47,10 +47,10 @@ def with_drift(graph: PoseGraph, factor: float, config: GraphConfig) -> list[Con
 
 
 def drift_factor(graph: PoseGraph, loops: Sequence[Constraint], config: GraphConfig) -> float:
-    """The factor on `drift_covariance`, 0 where none is needed, with which the median residual has its expected size.
+    """Factor on odometry's drift covariance with which the median residual has its expected size; 0 where none is needed.
 
-    Fixes and walls of a map are so much noisier than odometry that chance among them would give a large drift: they count where
-    the median is significant. At least `tilt_factor`.
+    Fixes and walls of a map are much noisier than odometry, so they count only where their median is significant. The factor is
+    at least `tilt_factor`.
     """
     on_map = _as_fixes(graph)
     if not loops and max(len(graph.fixes), len(on_map)) < 2 and not graph.ups:
@@ -103,6 +103,7 @@ def _between(chain: Floats, poses: Floats, a: NDArray[np.intp], b: NDArray[np.in
 
 
 def _of_loops(graph: PoseGraph, loops: Sequence[Constraint], white: Floats, drift: Floats) -> float:
+    """Drift factor by the residuals of loop closures; white, drift : (K, 6, 6) covariances of the chains of `chains`."""
     few = [loops[i] for i in np.unique(np.linspace(0, len(loops) - 1, MOST).round().astype(int))]
     a, b = np.array([c.a for c in few]), np.array([c.b for c in few])
     T = np.stack([c.T_a_b for c in few])
@@ -117,9 +118,9 @@ def _of_loops(graph: PoseGraph, loops: Sequence[Constraint], white: Floats, drif
 def _of_fixes(
     poses: Floats, fixes: Sequence[PositionFix], dim: int, white: Floats, drift: Floats, probability: float
 ) -> float:
-    """By pairs of fixes, half the fixes apart: difference between their displacement and odometry's, along `dim` axes.
+    """Drift factor by pairs of fixes, half the fixes apart: their displacement minus odometry's, along `dim` axes.
 
-    probability : of the median under the null hypothesis, below which there is no drift
+    probability : of the median under the null hypothesis, below which the factor is 0
     """
     half = len(fixes) // 2
     if not half:
@@ -141,7 +142,7 @@ def _of_fixes(
 
 
 def _of_ups(graph: PoseGraph, white: Floats, drift: Floats, config: GraphConfig) -> float:
-    """By all measurements of up: their tilt in the world of odometry relative to the first.
+    """Drift factor by the tilts of all measured up directions in odometry's world, relative to the first.
 
     Gravity is mostly less accurate than odometry: only a significant tilt counts.
     """

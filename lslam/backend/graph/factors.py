@@ -56,7 +56,7 @@ def between_all(constraints: Sequence[Constraint]) -> list[Any]:
 
 
 def between_makers(constraints: Sequence[Constraint]) -> list[Callable[[float, Any], Any]]:
-    """What makes each, by scale and kernel as `between` does: linear algebra of thousands takes longer one by one."""
+    """For each constraint a function of scale and robust kernel that makes its factor; one linear algebra call serves all."""
     import gtsam
 
     if not constraints:
@@ -72,7 +72,7 @@ def between_makers(constraints: Sequence[Constraint]) -> list[Callable[[float, A
 
 
 def position(fix: PositionFix, scale: float = 1.0, kernel: Any = None) -> Any:
-    """A measured position of the antenna."""
+    """Factor of a measured antenna position: scale : on its covariance; kernel : of gtsam, None: not robust."""
     import gtsam
 
     model = _robust(gtsam.noiseModel.Diagonal.Sigmas(np.sqrt(scale) * fix.sigma), kernel)
@@ -95,7 +95,7 @@ def position(fix: PositionFix, scale: float = 1.0, kernel: Any = None) -> Any:
 
 
 def _between_keyframes(fix: PositionFix, model: Any) -> Any:
-    """A measured position on the way from one keyframe to the next: scans there follow both."""
+    """Factor of an antenna position between two keyframes, interpolated linearly between theirs by `fix.share`."""
     import gtsam
 
     ends = ((fix.keyframe, fix.arm, 1.0 - fix.share), (fix.keyframe + 1, fix.next_arm, fix.share))
@@ -142,9 +142,10 @@ def map_key(graph: PoseGraph) -> int:
 
 
 def fixed_part(graph: PoseGraph, may_tilt: bool = False, with_lidar: bool = True) -> Any:
-    """The factors that are no outlier candidates, held ones too; with `may_tilt` the first pose may tilt.
+    """All factors that are no outlier candidates, binding ones included.
 
-    with_lidar : odometry and held loop closures are among them
+    may_tilt : a wide prior on roll and pitch of the first pose
+    with_lidar : include odometry and binding loop closures
     """
     import gtsam
 
@@ -180,7 +181,7 @@ def _relative(graph: PoseGraph, with_lidar: bool) -> list[Any]:
 
 
 def _start(graph: PoseGraph, may_tilt: bool) -> Any:
-    """The prior on the first pose."""
+    """Prior factor on the first pose: tight if the graph is anchored there, wide if fixes define its frame."""
     import gtsam
 
     sigma_m, sigma_rad = HELD if graph.is_anchored else FREE
@@ -197,7 +198,7 @@ def _start(graph: PoseGraph, may_tilt: bool) -> Any:
 
 
 def start_values(graph: PoseGraph, poses: Floats) -> Any:
-    """Initial values of all variables, poses (K, 4, 4) of the keyframes."""
+    """Initial values of all variables of the graph, for `poses` (K, 4, 4) of the keyframes."""
     import gtsam
 
     values = gtsam.Values()
@@ -237,7 +238,7 @@ def _floor(floor: FloorPlane, key: int) -> Any:
 
 
 def _add_fix_noise(factors: Any, fix_noise: GaussMarkovNoise) -> None:
-    """A first-order Gauss-Markov process in its steady state.
+    """Add the factors of a stationary first-order Gauss-Markov process.
 
     (b - p a)^2 = p (b - a)^2 + (1 - p) b^2 - p (1 - p) a^2: between factors of instants a and b, and a prior on each.
     """
@@ -324,7 +325,7 @@ def inertial_factors(chain: InertialChain, world_up: Floats) -> list[Any]:
 
 
 def insert_inertial(values: Any, chain: InertialChain, poses: Floats) -> None:
-    """Start values: the velocity over the way to the next keyframe, and the biases of the run's end."""
+    """Insert initial velocities (mean between keyframes, m/s) and biases (those of the run's end) of the chain into `values`."""
     import gtsam
 
     bias = gtsam.imuBias.ConstantBias(chain.accel_bias, chain.gyro_bias)

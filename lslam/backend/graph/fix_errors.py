@@ -112,7 +112,7 @@ def _pairs(seconds: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 
 def _turn(own: Floats, displacements: Floats) -> float:
-    """rad, by which `own` (P, 2) is turned to fit `displacements` (P, 2); pairs without odometry, or too long, do not count."""
+    """Rotation, rad, that aligns `own` (P, 2) with `displacements` (P, 2); pairs without odometry or too long are ignored."""
     ok = np.isfinite(own).all(1)
     turn, weights = 0.0, ok.astype(float)
     for _ in range(4):
@@ -143,11 +143,11 @@ def _sum_of_squares(sizes: Floats) -> float:
 
 
 def actual_sigmas(seconds: Floats, residuals: Floats, sigmas: Floats, probability: float) -> Floats | None:
-    """(3,) factors by which fixes err more than they state, 1 where they do not; None where none does.
+    """(3,) ratios of the actual to the stated sigma per axis, at least 1; None where the statement holds for all.
 
     seconds : (F,) ascending; residuals : (F, 3) m, fixes minus trajectory, roughly aligned; sigmas : (F, 3) m, stated
 
-    Differences of successive fixes contain no drift of odometry: where they scatter by more than is stated, the statement is
+    Differences of successive fixes contain no drift of odometry: if they scatter by more than is stated, the statement is
     wrong, and the sigma is that of the scatter within half a minute.
     """
     gaps = np.diff(seconds)
@@ -168,10 +168,10 @@ def actual_sigmas(seconds: Floats, residuals: Floats, sigmas: Floats, probabilit
 
 
 def _noise_beside_outliers(steps: Floats, probability: float) -> float:
-    """The sigma of the fixes that makes their differences likeliest, in that which they state; 1 unless that is too small.
+    """Maximum-likelihood sigma of the fixes' differences, in stated sigmas; 1 unless that is significantly too small.
 
-    steps : (N,) differences of two of them. Some are of outliers, whose size has an even distribution over all magnitudes: fixes
-    of which a third is wrong do not scatter.
+    steps : (N,) normalised differences of two fixes. Some are outliers, log-uniform in size, so that a third of wrong fixes
+    does not count as scatter.
     """
     sizes = np.abs(steps - np.median(steps))
     wide = 1.0 / (np.maximum(sizes, 1.0) * 2.0 * (1.0 + np.log(max(float(sizes.max()), 2.0))))
@@ -187,9 +187,9 @@ def _noise_beside_outliers(steps: Floats, probability: float) -> float:
 
 
 def rough_residuals(seconds: Floats, antenna: Floats, positions: Floats) -> Floats:
-    """(F, 3) m, of `positions` (F, 3) minus level `antenna` (F, 3) after a robust fit of heading and place.
+    """Residuals (F, 3), m: fixes `positions` (F, 3) minus level `antenna` (F, 3) after a robust fit of heading and translation.
 
-    seconds : (F,). The heading begins with that of displacements, which a jump of all fixes does not change.
+    seconds : (F,). The initial heading is that of displacements, which a jump of all fixes does not change.
     """
     far = np.linalg.norm(positions - np.median(positions, axis=0), axis=1)
     first, last = _pairs(seconds)
@@ -210,7 +210,7 @@ def rough_residuals(seconds: Floats, antenna: Floats, positions: Floats) -> Floa
 
 
 def agreeing_heights(off: Floats, sigmas: Floats) -> Bools:
-    """(F,) whether a height belongs to the level at which most of them lie.
+    """(F,) whether the height of each fix belongs to the level of the majority.
 
     off : (F,) m, of fixes minus trajectory; sigmas : (F,) m
     """
@@ -223,12 +223,12 @@ def agreeing_heights(off: Floats, sigmas: Floats) -> Bools:
 
 
 def height_levels(off: Floats, sigmas: Floats) -> Floats:
-    """(F,) m, by which a height lies above the first ones, as far as heights jump from one fix to the next.
+    """(F,) m, level of each height above that of the first ones: the sum of the jumps between successive fixes before it.
 
     off : (F,) m, of fixes minus trajectory, in order of time; sigmas : (F,) m
 
     Medians before and after a fix differ by a jump, while a tilt and odometry's drift change them little. A jump exceeds
-    the sigma of a height, and what such differences are elsewhere.
+    the sigma of a height, and the scatter of such differences elsewhere.
     """
     levels = np.zeros(len(off))
     if len(off) < 2 * FEWEST:

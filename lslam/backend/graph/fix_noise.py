@@ -128,10 +128,10 @@ def _likeliest(
     drift: DriftOfFixes,
     least_gain: float,
 ) -> tuple[float, float, float]:
-    """Time constant, s, and variance of what residuals `ratios` (F, 3) have beside their `white` part, and drift factor.
+    """Time constant, s, and variance of the correlated part of `ratios` (F, 3) beside its `white` part, and drift factor.
 
-    slow : (V,) variances that are tried; a single one is known
-    least_gain : logarithm of the likelihood that drift must gain
+    slow : (V,) candidate variances; least_gain : log-likelihood that drift must gain
+    ratios : residuals in stated sigmas
     Drift is a random walk, or a constant rate of equal variance at the end of the way. It is accepted where the likelihood,
     marginal over time constants, gains enough.
     """
@@ -179,7 +179,7 @@ def _likeliest(
 
 
 def _interpolate(grid: Floats, likelihoods: Floats, axis: int) -> tuple[Floats, Floats]:
-    """Positive numbers between those `grid`, and a cubic spline of the logarithms of their likelihoods along `axis`."""
+    """`grid` refined, and the log-likelihoods along `axis` at it by a cubic spline in the logarithm of the grid."""
     from scipy.interpolate import CubicSpline
 
     if len(grid) == 1:
@@ -189,9 +189,9 @@ def _interpolate(grid: Floats, likelihoods: Floats, axis: int) -> tuple[Floats, 
 
 
 def _lasting(metre: Floats, places: Floats) -> Floats:
-    """(3 F, 3 F) m2 of `places` (F, 3), m, under constant rates of drift.
+    """Covariance (3 F, 3 F), m2, of positions `places` (F, 3), m, under constant rates of drift.
 
-    metre : (6, 6) of a random walk over one metre, with equal variance at the end of the way
+    metre : (6, 6) covariance of a random walk over one metre, whose variance at the end of the way is the same
     """
     steps = np.diff(places, axis=0)
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(steps, axis=1))])
@@ -222,7 +222,7 @@ def _log_likelihoods(base: Floats, walk: Floats, rates: Floats, sides: Floats) -
 
 
 def _beside_white(values: Floats, axes: Floats, sides: Floats) -> Floats:
-    """As `_log_likelihoods`, of factor x `values` (R,) along the `axes` (N, R) and unit variance along all."""
+    """`_log_likelihoods` for the covariance factor x `values` (R,) along the `axes` (N, R) plus the identity."""
     along, spread = axes.T @ sides, 1.0 + FACTORS[:, None] * values
     rest = sides - axes @ along
     products = (along[:, :, None] * along[:, None, :]).reshape(len(along), -1)

@@ -38,7 +38,7 @@ class InertialSmoother(Stateful):
         self.newest: InertialState | None = None
 
     def begin(self, state: InertialState) -> None:
-        """Forget all steps; `state` is the prior of the first."""
+        """Discard all steps and begin a new graph with `state` as the prior of its first state."""
         import gtsam
 
         self._begun, self._steps, self.newest = state, [], state
@@ -73,7 +73,7 @@ class InertialSmoother(Stateful):
         return {"begun": self._begun, "steps": Records(list(self._steps))}
 
     def restore(self, state: State) -> None:
-        """Go on where `state` was taken: the same steps in the same order give the same bytes."""
+        """Continue from a saved `state`: the same steps in the same order give the same bytes."""
         self._solver = self._begun = self.newest = None
         self._steps = []
         if state["begun"] is not None:
@@ -82,6 +82,7 @@ class InertialSmoother(Stateful):
                 self._take(step)
 
     def _take(self, step: InertialStep) -> InertialState:
+        """Add one step to the graph and return the newest state; raises GraphError when iSAM2 fails."""
         import gtsam
 
         before = self.newest
@@ -110,6 +111,7 @@ class InertialSmoother(Stateful):
         return self.newest
 
     def _estimate(self, k: int) -> InertialState:
+        """State number `k` of the solver with its joint covariance, in the axes of `InertialState`."""
         solver, pose, speed, bias = self._solver, 4 * k, 4 * k + 1, 4 * k + 2
         T = se3.normalise(solver.calculateEstimatePose3(pose).matrix())
         biases = solver.calculateEstimateConstantBias(bias)
@@ -135,6 +137,7 @@ class InertialSmoother(Stateful):
 
 
 def _values(k: int, state: InertialState) -> Any:
+    """gtsam values of state number `k`: pose, velocity and biases."""
     import gtsam
 
     values = gtsam.Values()
@@ -154,7 +157,7 @@ def _predict(before: InertialState, increments: Any) -> tuple[Floats, Floats]:
 
 
 def _prior(state: InertialState) -> Any:
-    """All of the first state at once: its parts are correlated, gravity with the accelerometer's bias above all."""
+    """Joint prior on the first state, whose parts are correlated: gravity with the accelerometer's bias above all."""
     import gtsam
 
     J = _into_house(state.T_world_imu).T

@@ -79,7 +79,7 @@ def without_loop_drift(graph: PoseGraph, config: GraphConfig) -> PoseGraph:
 class _Fit:
     """Likelihood of rates given loop closures, for the odometry of `graph` corrected by `rates` (6 n,) at the knots.
 
-    Rates are along the axes of the odometry given, which `rotations` (K-1, 3, 3) takes into those of the graph.
+    Rates are along the axes of the original odometry, which `rotations` (K-1, 3, 3) takes into those of the graph.
     Errors are twists of the world about the middle of the way, where those of parts of the way add up.
     negative_log_likelihood : (walks, 1 + LASTS * SIZES) twice, up to a constant; column 0 is the null hypothesis without rates
     """
@@ -171,9 +171,9 @@ def _accumulate_turns(turns: Floats, ways: Floats) -> Floats:
 
 
 def _effects(poses: Floats, distances: Floats, rotations: Floats) -> Iterator[tuple[slice, Floats]]:
-    """Keyframes, part after part, and their Jacobians (k, 6, 6 n): twist about the origin by rates at the knots.
+    """Blocks of keyframes with their Jacobians (k, 6, 6 n): twist about the origin by the rates at the knots.
 
-    rotations : as of `_accumulate_turns`
+    rotations : (K-1, 3, 3) from the axes of the rates into those of the graph
     """
     passed = np.diff(distances)[:, None] * linear_basis(distances, _apart(distances))
     passed, rotations = (np.concatenate([0.0 * rows[:1], rows]) for rows in (passed, rotations))

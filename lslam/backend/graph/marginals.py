@@ -35,7 +35,7 @@ class PosePrior:
 
 
 def pose_prior(factors: Any, values: Any, count: int) -> PosePrior:
-    """Information that gtsam's `factors` give of the poses with the keys 0..count-1 at `values`; other unknowns are eliminated.
+    """Information of gtsam's `factors` about the poses with keys 0..count-1, linearised at `values`, other unknowns eliminated.
 
     Raises GraphError where the factors do not determine the other unknowns.
     """
@@ -81,7 +81,7 @@ def marginals(factors: Any, values: Any, poses: Floats) -> Floats:
 
 
 def marginal_blocks(factors: Any, values: Any, keys: Iterable[int]) -> Floats:
-    """(K, 6, 6) covariances of the poses with these keys, in gtsam's order and axes.
+    """(K, 6, 6) covariances of the poses with these keys, in gtsam's order (rotation first) and body axes.
 
     Raises GraphError when the graph is singular.
     """
@@ -98,7 +98,10 @@ def marginal_blocks(factors: Any, values: Any, keys: Iterable[int]) -> Floats:
 
 
 def scaled_blocks(factors: Any, values: Any, keys: list[int]) -> Floats:
-    """What `marginal_blocks` gives, by normal equations scaled so that each unknown counts alike."""
+    """(K, 6, 6) covariances of the poses with these keys, like `marginal_blocks`, by normal equations of scaled unknowns.
+
+    The scaling keeps precision where variances differ by many orders. Raises GraphError when the graph is singular.
+    """
     H, begins = _normal_matrix(factors, values, map(int, values.dims()))
     try:
         solve = _scaled_solver(H)
@@ -126,7 +129,7 @@ def _normal_matrix(factors: Any, values: Any, keys: Iterable[int]) -> tuple[Any,
 
 
 def _scaled_solver(H: Any) -> Callable[[Floats], Floats]:
-    """Solver of the normal equations (N, N), scaled so that each unknown counts alike. Raises RuntimeError where singular."""
+    """Solver of the sparse normal equations `H` (N, N), scaled to a unit diagonal. Raises RuntimeError where H is singular."""
     from scipy.sparse import diags_array
     from scipy.sparse.linalg import splu
 
@@ -198,7 +201,7 @@ def _family(keys: list[int], above: _Family, own: Floats, cross: Floats, parents
 
 
 def _inverses(matrices: list[Floats]) -> list[Floats]:
-    """Of square matrices of some sizes, all of one size at once."""
+    """Inverses of square matrices of different sizes, in their order; all of one size are inverted at once."""
     sizes = np.array([len(matrix) for matrix in matrices])
     inverses = list(matrices)
     for size in np.unique(sizes):

@@ -33,11 +33,11 @@ def odometry_constraints(
     config: GraphConfig,
     fitness: Sequence[float] | None = None,
 ) -> list[Constraint]:
-    """From each keyframe to the next, with the growth of odometry's covariance on the way.
+    """Constraints from each keyframe to the next, with the growth of odometry's covariance between them.
 
     A scan's covariance is that of the local map and that of its registration on it; only the former accumulates
     (`odometry.uncertainty`). Methods without covariances get the drift of `config`.
-    fitness : of each keyframe but the first with the one before, m2, where covariances come of that
+    fitness : (K-1,) fitness score of each keyframe against the one before, m2, for `graph.information = fitness`, else None
     """
     constraints = []
     for k, (before, after) in enumerate(pairwise(keyframes)):
@@ -87,7 +87,10 @@ def fitness_covariance(score: float, config: GraphConfig) -> Floats:
 
 
 def growth(a: ScanResult, b: ScanResult, way: float, config: GraphConfig) -> Floats:
-    """(6, 6) growth of odometry's covariance, world axes, from scan `a` to scan `b`, `way` m on."""
+    """(6, 6) growth of odometry's covariance, world axes, from scan `a` to scan `b`; way : distance travelled between, m.
+
+    Very large where the two lie in different segments; the drift of `config` for methods without covariances.
+    """
     if a.frame != b.frame:
         return np.diag(np.repeat([FREE_M**2, FREE_RAD**2], 3))
     of_a, of_b = _of_map(a), _of_map(b)
@@ -162,7 +165,10 @@ def _covariance(
     drift: float,
     config: GraphConfig,
 ) -> Floats:
-    """(6, 6) of a scan's pose: its keyframe's, odometry's growth between them, and its own registration."""
+    """(6, 6) of a scan's pose: its keyframe's covariance, odometry's growth between them, and its own registration.
+
+    final, odometry : (4, 4) of the scan after and before the graph; pose, covariance : of the keyframe after it; drift : factor
+    """
     step = final[:3, 3] - pose[:3, 3]
     first, last = (keyframe, result) if keyframe.stamp_ns <= result.stamp_ns else (result, keyframe)
     way = float(np.linalg.norm(step))

@@ -49,7 +49,7 @@ class Drift:
     rad_per_m: float
 
     def covariance(self, a: NDArray[Any], b: NDArray[Any]) -> Floats:
-        """(P, 6, 6) of the pose of keyframes `b` (P,) seen from `a` (P,), isotropic; a turn moves what lies ahead of it."""
+        """(P, 6, 6) of the poses of keyframes `b` (P,) relative to `a` (P,): isotropic, with the lever arm of heading drift."""
         way = np.abs(self.distances[b] - self.distances[a])
         steps = np.linspace(0, 1, SAMPLES)
         between = np.round(a[:, None] + steps * (b - a)[:, None]).astype(np.intp)
@@ -67,7 +67,7 @@ def drift_of(graph: PoseGraph, config: GraphConfig) -> Drift:
 
 
 def judge_loops(graph: PoseGraph, config: GraphConfig) -> list[str]:
-    """Per loop closure why it is rejected, empty where it is accepted."""
+    """Reason why each loop closure is rejected, empty where it is accepted: odometry or most of its neighbours contradict it."""
     reasons = [""] * len(graph.loops)
     if not graph.loops:
         return reasons
@@ -148,9 +148,9 @@ def _voted_out(graph: PoseGraph, ends: Ends, drift: Drift, limit: float) -> list
 def _cycle_errors(
     graph: PoseGraph, ends: Ends, drift: Drift, i: NDArray[Any], j: NDArray[Any]
 ) -> tuple[Floats, Floats]:
-    """(P,) squared Mahalanobis distances from the identity of a_i -> b_i -> b_j -> a_j -> a_i.
+    """(P,) squared Mahalanobis distances of the cycle a_i -> b_i -> b_j -> a_j -> a_i from the identity.
 
-    Beside them the sharpness of each test: the inverse variance, 1/m2, of drift on the way.
+    The second array (P,) is the inverse variance, 1/m2, of drift in the cycle, which says how strict each test is.
     """
     ahead = se3.relative(graph.poses[ends.b[i]], graph.poses[ends.b[j]])
     home = se3.relative(graph.poses[ends.a[j]], graph.poses[ends.a[i]])
@@ -187,9 +187,9 @@ def _isotropic(sigma_m: Floats, sigma_rad: Floats) -> Floats:
 def optimise(graph: PoseGraph, config: GraphConfig) -> Solution:
     """Poses and covariances of all keyframes, and which loop closures, fixes and planar priors are inliers.
 
-    Where some are held, everything else is judged from where these put the poses. Loop closures inconsistent with each other
-    or with odometry are rejected first; odometry's covariances grow by the drift that the others reveal; then all is solved
-    together, with loop closures, fixes and planar priors that are not held as outlier candidates.
+    Binding ones are applied first, and everything else is judged from the poses that result. Loop closures inconsistent with each
+    other or with odometry are rejected; odometry's covariances grow by the drift that the others reveal; then all is solved
+    together, with loop closures, fixes and planar priors that are not binding as outlier candidates.
 
     Raises GraphError when the graph is disconnected, singular or not finite.
     """
@@ -265,9 +265,9 @@ def optimise(graph: PoseGraph, config: GraphConfig) -> Solution:
 
 
 def apply_manual(graph: PoseGraph, config: GraphConfig) -> PoseGraph:
-    """The graph with its poses where the held loop closures and positions alone put them, and the drift that these reveal.
+    """The graph at the poses that its binding loop closures and fixes alone imply, with the drift that these reveal.
 
-    What odometry may drift is no measure for the rest once a person has said how far it did.
+    Other constraints are judged from these poses, not from odometry's. Raises GraphError when it cannot be solved.
     """
     loops, fixes = [loop for loop in graph.loops if loop.is_binding], [fix for fix in graph.fixes if fix.is_binding]
     if not (loops or fixes):

@@ -27,7 +27,7 @@ IN = 0.999
 
 
 def solve(factors: Any, values: Any, config: GraphConfig) -> Any:
-    """The values at which `factors` fit best, from `values` on.
+    """The values that minimise the error of `factors`, from the initial `values`.
 
     Raises GraphError when the graph is singular or the solution is not finite, InterruptedRunError as `check_stop`.
     """
@@ -50,10 +50,10 @@ def solve(factors: Any, values: Any, config: GraphConfig) -> Any:
 
 
 def refine(factors: Any, values: Any, config: GraphConfig) -> Any:
-    """As `solve`, from values near the solution, by Gauss-Newton.
+    """Gauss-Newton from `values` close to the solution, then `solve` where a step does not lower the cost. Errors as there.
 
-    A step's linear cost foretells the cost behind it. Where that holds to the optimiser's own tolerance, the next step would
-    lower it by no more than that, and is not made. Where a step does not lower the cost, `solve` goes on.
+    A step's linear cost predicts the cost after it. If the prediction holds within the optimiser's own tolerance, the next step
+    would lower the cost by no more than that, and is omitted.
     """
     import gtsam
 
@@ -78,7 +78,7 @@ def refine(factors: Any, values: Any, config: GraphConfig) -> Any:
 
 
 def solve_incrementally(factors: Any, values: Any, count: int) -> Any:
-    """The same by iSAM2, keyframes 0, 1, ... in turn: each factor enters with the last of its keyframes.
+    """Solve by iSAM2, adding keyframes 0, 1, ... `count` - 1 in turn: each factor enters with the last of its keyframes.
 
     Raises GraphError as `solve` does.
     """
@@ -168,6 +168,7 @@ def _solve_gnc(
     values: Any,
     config: GraphConfig,
 ) -> GncResult:
+    """Graduated non-convexity with truncated least squares; plain : the candidates' factors, limits : of squared residuals."""
     weights = np.ones(len(plain))
     factors = join_factors(base, plain)
     values = solve(factors, values, config)
@@ -217,7 +218,7 @@ def _weight(candidates: Sequence[OutlierCandidate], plain: list[Any], weights: F
 
 
 def join_factors(base: Any, more: list[Any]) -> Any:
-    """The factor graph `base` and more factors; `base` stays as it is."""
+    """A copy of the factor graph `base` with more factors."""
     import gtsam
 
     factors = gtsam.NonlinearFactorGraph(base)

@@ -64,7 +64,7 @@ def view(points: Floats, ground: Floats, R: Floats, edge: float, most: float, im
 
 @kernel
 def improve(sums: Image, cells: Longs, least: np.float32, yaw: np.float32, best: Row, turn: Row) -> None:
-    """Where sums (3, C) at the cells (K,) give a better score than `best` (K,), put it there, and `yaw` into `turn` (K,).
+    """Where sums (3, C) at the cells (K,) give a better score than `best` (K,), store it there, and `yaw` in `turn` (K,).
 
     The score is the first sum by the root of the product of the others, 0 where the second is below `least`.
     """

@@ -14,7 +14,7 @@ Floats = NDArray[np.float64]
 
 @inline
 def largest_eigenvalue(a: float, b: float, c: float, d: float, e: float, f: float) -> float:
-    """Of the symmetric matrix [[a, b, c], [b, d, e], [c, e, f]], in closed form (Smith 1961)."""
+    """Largest eigenvalue of the symmetric matrix [[a, b, c], [b, d, e], [c, e, f]], in closed form (Smith 1961)."""
     mean = (a + d + f) / 3.0
     a, d, f = a - mean, d - mean, f - mean
     p = math.sqrt((a * a + d * d + f * f + 2.0 * (b * b + c * c + e * e)) / 6.0)

@@ -20,9 +20,9 @@ Longs = NDArray[np.int64]
 
 @kernel
 def number_cells(points: Floats, poses: Longs, edge: float) -> tuple[Longs, Longs]:
-    """Number (N,) of the cell of each point (N, 3), first come, first numbered; and how many of the `poses` saw each cell, (V,).
+    """Voxel index (N,) of each point (N, 3), in order of first appearance; and the number (V,) of poses that saw each voxel.
 
-    poses : (N,) number of the pose of each point, rising
+    poses : (N,) ascending pose number of each point; edge : m, of the voxels
     """
     numbers, count = np.empty(len(points), np.int64), 0
     table = np.empty(table_size(len(points)), np.int32)
@@ -49,9 +49,9 @@ def number_cells(points: Floats, poses: Longs, edge: float) -> tuple[Longs, Long
 
 @kernel
 def move(points: Floats, poses: Longs, shares: Floats, origins: Floats, turns: Floats, shifts: Floats) -> Floats:
-    """Points (N, 3) after corrections of the two poses round each.
+    """Points (N, 3) moved by the corrections of the two poses before and after each, interpolated.
 
-    poses : (N,) number of the first of both; shares : (N,) 0..1 of the way to the second
+    poses : (N,) index of the earlier pose; shares : (N,) 0..1 of the way from it to the later
     origins : (K, 3) m, of the sensor; turns : (K, 3, 3) about these; shifts : (K, 3) m
     """
     out = np.zeros_like(points)
@@ -121,7 +121,7 @@ def lever(n: Floats, mean: Floats, origin: Floats, out: Floats) -> None:
 def equations(
     starts: Longs, poses: Longs, shares: Floats, means: Floats, covariances: Floats, origins: Floats, floor: float
 ) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-    """Normal equations of the poses, and what the planes take from them.
+    """Normal equations of the poses, and their coupling with the planes, which are eliminated.
 
     starts : (V + 1,) first sighting of each plane; poses : (C,) the first of both poses of a sighting
     shares : (C,) 0..1; means : (C, 3), covariances : (C, 3, 3) of the sightings, m and m2, world

@@ -36,7 +36,7 @@ class KeyframeSelector(Stateful):
         self._segment = 0
 
     def consider(self, scan: int, result: ScanResult) -> Keyframe | None:
-        """The keyframe that scan number `scan` of the run becomes, or None; every scan of the run, in order."""
+        """The keyframe that scan number `scan` becomes, or None. Must be called for every scan of the run, in order."""
         pose = result.T_world_lidar
         if self._here is not None:
             self._travelled += float(np.linalg.norm(pose[:3, 3] - self._here[:3, 3]))

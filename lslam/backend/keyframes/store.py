@@ -70,9 +70,9 @@ class KeyframeStore(Stateful):
         return len(self.keyframes)
 
     def add(self, keyframe: Keyframe, points: Points, labels: Labels | None = None) -> None:
-        """Take the next keyframe with its cloud (N, 3), m, in the LiDAR frame at its scan's stamp; written at once.
+        """Append the next keyframe with its cloud (N, 3), m, in the LiDAR frame at its scan's stamp; written to disk at once.
 
-        labels : (N,) classes of its points, where they are known
+        labels : (N,) classes of its points, or None. Raises ValueError unless `keyframe.number` is the next number.
         """
         if keyframe.number != len(self):
             raise ValueError(f"keyframe {keyframe.number} cannot follow {len(self) - 1}")
@@ -101,6 +101,7 @@ class KeyframeStore(Stateful):
         return self._load(number)[1]
 
     def _load(self, number: int) -> tuple[Points, Labels | None]:
+        """Points and labels of keyframe `number`, from the cache or its file; raises InputError for a damaged one."""
         file = self._files[number]
         with self._lock:
             if file in self._recent:
@@ -145,7 +146,7 @@ class KeyframeStore(Stateful):
         return {**keyframe_arrays(self.keyframes), "files": np.array(self._files, np.int64)}
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Hold the keyframes of `state`; raises InputError when a cloud of theirs is not there."""
+        """Replace the keyframes by those of `state`; raises InputError when one of their clouds is missing."""
         keyframes = keyframes_of(state)
         files = [int(file) for file in state.get("files", np.arange(len(keyframes)))]
         if len(files) != len(keyframes):
@@ -169,6 +170,7 @@ class KeyframeStore(Stateful):
         return self.folder / f"{file:06d}.npz"
 
     def _keep(self, file: int, cloud: Points, labels: Labels | None) -> tuple[Points, Labels | None]:
+        """Put a cloud, now read-only, into the cache, which drops the least recently used ones."""
         cloud.flags.writeable = False
         with self._lock:
             self._recent[file] = cloud, labels
@@ -205,7 +207,7 @@ def _pack(arrays: Mapping[str, NDArray[Any]], level: int) -> dict[str, NDArray[n
 
 
 def _unpack(arrays: dict[str, NDArray[Any]], name: str) -> dict[str, NDArray[Any]]:
-    """Planes and labels from the file `name`, as `_pack` or an older version wrote them. Raises InputError for others."""
+    """The arrays of the file `name` with planes and labels decompressed. Raises InputError where they are damaged."""
     planes, labels = f"planes{ZST}", f"labels{ZST}"
     try:
         if planes in arrays:
@@ -218,7 +220,7 @@ def _unpack(arrays: dict[str, NDArray[Any]], name: str) -> dict[str, NDArray[Any
 
 
 def keyframe_arrays(keyframes: Sequence[Keyframe]) -> dict[str, NDArray[Any]]:
-    """Keyframes as arrays; a covariance that is not known is NaN."""
+    """Keyframes as arrays; a missing covariance is NaN."""
     none = np.full((6, 6), np.nan)
     return {
         "scans": np.array([k.scan for k in keyframes], np.int64),
@@ -267,10 +269,10 @@ def submap(
     voxel: float | None = None,
     T_world_frame: Floats | None = None,
 ) -> NDArray[np.float32]:
-    """Points (M, 3), m, of the `size` keyframes about keyframe `number`, in its LiDAR frame or in `T_world_frame` (4, 4).
+    """Points (M, 3), m, of `size` keyframes about keyframe `number`, in its LiDAR frame or in that of `T_world_frame` (4, 4).
 
     poses : (K, 4, 4) T_world_lidar of all keyframes, odometry's or optimised ones
-    voxel : m, one averaged point per voxel is left; None leaves all
+    voxel : m, one averaged point per voxel remains; None keeps all
     """
     frame = poses[number] if T_world_frame is None else T_world_frame
     clouds = {k: store.points(k) for k in neighbours(len(store), number, size)}

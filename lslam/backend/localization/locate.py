@@ -106,7 +106,7 @@ class PlaceFinder:
     """Finds the start of a drive in the map.
 
     store : the drive's keyframes at odometry's poses; config : also of how its sensor is mounted
-    reasons : why keyframes found no place
+    reasons : why keyframes were not located
     """
 
     def __init__(self, search: PlaceSearch, store: KeyframeStore, config: Config) -> None:
@@ -118,7 +118,7 @@ class PlaceFinder:
         self.reasons: list[str] = []
 
     def find(self, prior: StartPrior | None = None, should_stop: Callable[[], bool] = lambda: False) -> Start | None:
-        """The start; None, with `reasons`, when no keyframe finds a place or they do not agree."""
+        """The start; None, with `reasons`, when no keyframe is located or they do not agree, or when `should_stop` returns True."""
         votes: list[Vote] = []
         tried = 0
         throttle = LoopThrottle(SPACING_M)
@@ -140,7 +140,10 @@ class PlaceFinder:
         return None if agreed is None else replace(agreed, tried=tried)
 
     def vote(self, b: int, region: Region | None) -> Vote | None:
-        """The place of keyframe `b` in the map, None with one more of the `reasons` when there is none or more than one."""
+        """The pose of keyframe `b` in the map; None, with one more of the `reasons`, when no pose or more than one fits.
+
+        region : where to search, None for the whole map
+        """
         c, query = self.config.loops, make_level_submap(self._cloud(b), self.config.registration)
         guesses = self.search.guesses(query, region)
         if not guesses:
@@ -209,7 +212,7 @@ class PlaceFinder:
         return is_near and move < GUESSES_APART_M and float(so3.angle(gap[:3, :3])) < np.deg2rad(SAME_DEG) + turn
 
     def _agree(self, votes: list[Vote], least: int) -> Start | None:
-        """The start that at least so many keyframes vote for, and more than twice as many as for any other."""
+        """The start that at least `least` keyframes agree on, and more than twice as many as on any other; None without one."""
         groups: list[list[Vote]] = []
         for vote in votes:
             home = next((g for g in groups if self._same(g[-1], vote)), None)
@@ -233,10 +236,10 @@ class MapFollower(Stateful):
     """An error-state Kalman filter over SE(3): odometry predicts, registration on the map corrects.
 
     The prior's information enters the normal equations, so that the map corrects where its surfaces constrain a pose and odometry
-    decides along directions that they leave open. What the map corrects never changes the map.
+    decides along unobservable directions. The map itself is never changed.
 
-    T, P : pose (4, 4) in level axes of the map and its covariance (6, 6), of the scan seen last, as independent steps add up
-    way : m since the map last held a scan, over which odometry drifts steadily
+    T, P : pose (4, 4) in level axes of the map and its covariance (6, 6), of the last scan, by independent steps
+    way : m since the last accepted scan, over which odometry drifts steadily
     R_level_odometry : (3, 3) axes of odometry's world in those of the map
     """
 
@@ -252,7 +255,7 @@ class MapFollower(Stateful):
         self._floor = np.diag([c.sigma_m**2] * 3 + [np.deg2rad(c.sigma_deg) ** 2] * 3)
 
     def predict(self, before: ScanResult, result: ScanResult) -> None:
-        """Odometry's motion from one scan to the next."""
+        """Predict pose and covariance by odometry's motion from scan `before` to scan `result`."""
         step = se3.relative(before.T_world_lidar, result.T_world_lidar)
         T = se3.normalise(self.T @ step)
         way = float(np.linalg.norm(step[:3, 3]))
@@ -270,7 +273,10 @@ class MapFollower(Stateful):
         return self.P + np.diag(np.repeat([move**2, turn**2], 3))
 
     def correct(self, position: int, points: PreparedPoints | None) -> MapFix:
-        """The scan of that position of the run on the map; its points deskewed, None when there are none."""
+        """Register scan number `position` of the run on the map and correct by it, if it is accepted.
+
+        points : of the scan, deskewed; None where it has none
+        """
         if points is None or len(points.source) < MIN_SOURCE_POINTS:
             return self._propagate("unread", "no usable points")
         alignment = self.view.at(self.T[:3, 3])
@@ -292,9 +298,9 @@ class MapFollower(Stateful):
         return MapFix(self.T, self.P, "held", result.overlap, result.inlier_share, (move, turn))
 
     def _align(self, alignment: MapAlignment, points: PreparedPoints, start: Floats) -> RegistrationResult:
-        """Registration from the prior with its information, the kernel as wide as the prior is uncertain.
+        """Registration with the predicted pose's information as prior, and a kernel as wide as that pose is uncertain.
 
-        A prior wider than the widest kernel says next to nothing, and is the initial guess only.
+        A prior that is wider than the widest kernel serves as initial guess only.
         """
         c = self.config.registration
         width = max(self._uncertainty_m(), NEAR_KERNEL_FACTOR * KERNEL_MIN_M)
@@ -306,7 +312,7 @@ class MapFollower(Stateful):
         return optimise(*alignment.problem(points, start, c.kernel_max, c.max_iterations))
 
     def _judge(self, result: RegistrationResult) -> tuple[FixStatus, str]:
-        """What the map says of a scan, and why not more."""
+        """Status of a registered scan (held, changed or beyond the map) and the reason of the latter two."""
         limits = Acceptance(
             MAP_MIN_OVERLAP, MAP_MIN_INLIERS, needs_covariance=True, usual=self.usual, is_usual_of_matches=True
         )

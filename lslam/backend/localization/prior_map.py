@@ -59,7 +59,7 @@ class PriorMap:
 
     points : (N, 3) float32, m, sorted by block; T_map_level : (4, 4) from these axes into the map's own coordinates
     georeference : of the map's own coordinates, None when unknown; source : for messages
-    origin : (3,) m, what was taken from the coordinates of its file
+    origin : (3,) m, subtracted from the coordinates of its file
     """
 
     points: Points
@@ -110,7 +110,7 @@ def make_prior_map(
 ) -> PriorMap:
     """Level a cloud (N, 3), m, of the map's coordinates, which may be as large as those of a projection.
 
-    origin : (3,) m, what is taken from the coordinates of the file; up : (3,) unit vector in them, about which it is looked for
+    origin : (3,) m, to subtract from the coordinates of the file; up : (3,) unit vector in them, initial guess of the vertical
     Raises InputError for a cloud without finite points.
     """
     origin = np.zeros(3) if origin is None else origin
@@ -137,7 +137,7 @@ def insert_all(target: GaussianMap | LocalMap, points: Points) -> None:
 
 
 class LocalView:
-    """The map round the sensor as registration wants it, a function of the block that the sensor is in.
+    """The map round the sensor in the form that registration needs, a function of the block that the sensor is in.
 
     reach : m, how far points are needed
     """
@@ -147,7 +147,7 @@ class LocalView:
         self._alignments: OrderedDict[tuple[int, int], MapAlignment] = OrderedDict()
 
     def at(self, position: Floats) -> MapAlignment:
-        """Alignment with the map round a position (3,), level axes."""
+        """Alignment with the map round a position (3,), m, level axes; made for its block, and cached."""
         block = (int(np.floor(position[0] / BLOCK_M)), int(np.floor(position[1] / BLOCK_M)))
         if block not in self._alignments:
             self._alignments[block] = self._make(block)
@@ -157,6 +157,7 @@ class LocalView:
         return self._alignments[block]
 
     def _make(self, block: Sequence[int]) -> MapAlignment:
+        """Alignment with the map's points within reach of block (i, j), as a local map."""
         c = self._config
         centre = (np.array(block) + 0.5) * BLOCK_M
         # Nobody knows which beams saw a point of a finished map.
@@ -258,7 +259,7 @@ class PlaceSearch:
         return best
 
     def _pose(self, query: LevelSubmap, shift: Floats, yaw: float) -> Floats:
-        """(4, 4) with the median height difference of the ground in common."""
+        """Pose (4, 4) of the query by `shift` (2,), m, and `yaw`, rad; its height is the median difference of the common ground."""
         R = so3.exp(np.array([0.0, 0.0, yaw]))
         turned = query.ground @ R.T + np.array([*shift, 0.0])
         cells, inside = self.grid.cells_of(turned)

@@ -104,7 +104,7 @@ class Chain:
         return out
 
     def keyframes(self) -> list[Keyframe]:
-        """All keyframes with the covariance and the distance of one long drive that was carried from session to session."""
+        """All keyframes with covariance and distance travelled accumulated over all sessions, as in one drive."""
         out: list[Keyframe] = []
         covariance, distance = np.zeros((6, 6)), 0.0
         constraints, poses = self.odometry(), self.poses
@@ -130,7 +130,7 @@ class Chain:
         return positive(b.covariance - noise.transport(a.covariance, step)) + least
 
     def _break(self, n: int) -> Constraint:
-        """The initial tie of a session to the end of the one before, as uncertain as odometry leaves it over the ways between."""
+        """Constraint between session `n` and the end of the one before, with odometry's drift over the ways between them."""
         session, last = self.sessions[n], int(self.firsts[n]) - 1
         T = se3.relative(self._whole[n - 1][-1], self._whole[n][0])
         assert session.start is not None
@@ -162,7 +162,11 @@ def tie(
     should_stop: Callable[[], bool] = lambda: False,
     vicinity: Vicinity | None = None,
 ) -> tuple[Session | None, str]:
-    """The session in the common world of the known ones, or None and why it is not found among them."""
+    """Locate a session in the map of the `others`: the session in their world, or None and the reason.
+
+    vicinity : position and radius to search in, instead of the georeferences
+    should_stop : asked between keyframes; the result is None then
+    """
     cloud = np.concatenate([_cloud_of(s) for s in others])
     prior_map = make_prior_map(
         cloud.astype(np.float64), config.registration, source="the sessions before", up=others[0].up
@@ -184,7 +188,7 @@ def tie(
 
 
 def by_georeference(session: Session, others: Sequence[Session]) -> Floats | None:
-    """(4, 4) from its world into the common one, by the first known one that lies on the Earth; None without two that do."""
+    """Transform (4, 4) of the session's world into the common one by georeferences; None without two of them."""
     other = next((s for s in others if s.georeference is not None), None)
     if other is None or other.georeference is None or session.georeference is None:
         return None

@@ -141,7 +141,7 @@ class Detector:
         return candidates
 
     def verify_pair(self, pair: KnownPair) -> LoopCandidate:
-        """The pair registered, whatever odometry says of its place; of its heading odometry is believed where it is sure."""
+        """Verify a known pair within its given radius, whatever odometry's position; headings as far as odometry is uncertain."""
         self._level_world()
         a, b = pair.a, pair.b
         turn = self._turn(self.uncertainty.between(b, np.array([a])))
@@ -154,7 +154,7 @@ class Detector:
         return self._candidate(a, b, check, is_binding=not check.reason)
 
     def _due_after(self, b: int, gates: SharedResults[Longs], throttle: LoopThrottle) -> Iterator[int]:
-        """The next keyframes after `b` that are due if all verdicts are as the last one."""
+        """Keyframes after `b` that will be verified if all verdicts equal the last one; for threads that work ahead."""
         throttle = copy(throttle)
         throttle.observe(self.keyframes[b].distance, throttle.last or Verdict.ACCEPTED)
         for n in range(b + 1, min(b + CACHE_GATES, len(self.keyframes))):
@@ -165,7 +165,7 @@ class Detector:
                 throttle.observe(self.keyframes[n].distance, throttle.last or Verdict.ACCEPTED)
 
     def _examine_all(self, b: int, older: Longs, clock: StageClock) -> list[LoopCandidate]:
-        """Keyframe `b` verified against the similar ones of the `older`, with verdicts."""
+        """Candidates of keyframe `b` with its similar ones among `older`, verified; at most one is accepted."""
         with clock.stage("loops"):
             alike, fallback = self._choose(b, older)
             verified = [self._examine(match, b) for match in alike]
@@ -175,7 +175,7 @@ class Detector:
             return examined
 
     def _level_world(self) -> None:
-        """Rotate the world so that z is up, as BEV correlation needs. Relative poses stay."""
+        """Rotate the keyframes, once, so that their ground planes are level, as BEV correlation needs; relative poses stay."""
         if self._is_level:
             return
         self._is_level = True
@@ -186,7 +186,7 @@ class Detector:
         self.uncertainty = OdometryUncertainty(self.keyframes, self.config.drift_percent, self.config.drift_deg)
 
     def _rehearse(self, limit: float, should_stop: Callable[[], bool]) -> Longs:
-        """(K,) place of each keyframe: that of the one before, if its first is near and their descriptors within `limit`."""
+        """(K,) place of each keyframe: its predecessor's, if that place's first is near and their descriptors within `limit`."""
         place_of, first = np.zeros(len(self.keyframes), np.int64), 0
         for k in range(1, len(self.keyframes)):
             _stop_if(should_stop(), k, len(self.keyframes))
@@ -218,7 +218,7 @@ class Detector:
         return float(np.linalg.norm(self.uncertainty.positions[b] - self.uncertainty.positions[a]))
 
     def _choose(self, b: int, older: Longs) -> tuple[list[PlaceMatch], Callable[[], list[PlaceMatch]]]:
-        """The candidates to verify, and what gives a fallback, if there is one.
+        """The candidates of keyframe `b` to verify, and a function that returns those to verify if they are all rejected.
 
         Where odometry is nearly certain, its nearest is the candidate and the most similar the fallback. Elsewhere it is the
         other way round, and all that are nearly as similar are verified, since an ambiguous one must be rejected.
@@ -263,7 +263,7 @@ class Detector:
         return chosen
 
     def _examine(self, match: PlaceMatch, b: int) -> LoopCandidate:
-        """Verify the loop of keyframe `b` with the match."""
+        """Verify the loop between keyframe `b` and the older one of the match, by submaps and odometry's gate."""
         a = match.number
         uncertainty = self.uncertainty.between(b, np.array([a]))
         expected = self.uncertainty.positions[b] - self.uncertainty.positions[a]
@@ -305,7 +305,10 @@ class Detector:
         return np.asarray(centre + TURN_STEP * np.arange(-count, count + 1))
 
     def _beyond(self, check: Verification, expected: Floats, uncertainty: RelativeUncertainty) -> str:
-        """Why the pose found lies outside the gate of odometry; empty inside."""
+        """Reason why a verified pose lies outside the gate of odometry; empty inside.
+
+        expected : (3,) m, of b relative to a by odometry
+        """
         assert check.T_a_b is not None
         shift = check.T_a_b[:3, 3] - expected
         turn = float(so3.angle(check.T_a_b[:3, :3]))

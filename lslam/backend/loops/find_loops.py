@@ -43,14 +43,14 @@ def find_loops(
 
     store : the run's keyframes with odometry's poses, their covariances and the distance travelled
     submap_size : keyframes whose clouds make one submap (`keyframes.submap_size`)
-    clocks : take the time of each keyframe, stage `loops`
-    threads : so many keyframes are verified at once; the candidates do not depend on it
-    keyframes : those of the store at other poses than odometry's; forbidden : pairs of them that are no candidates, nor are
-        those around them
+    clocks : measure the time of each keyframe, stage `loops`
+    threads : number of keyframes verified at once; the candidates do not depend on it
+    keyframes : those of the store at other poses than odometry's; forbidden : pairs excluded as candidates, with those around
+     them
     up : (3,) unit vector, up in their world by the mounting of the sensor
 
     An accepted candidate carries its constraint, T_a_b between LiDAR frames. Raises InterruptedRunError when `should_stop`
-    said so between two keyframes.
+    returns True between two keyframes.
     """
     at = store.keyframes if keyframes is None else keyframes
     detector = _detector(store, at, config, registration, submap_size, forbidden, up)
@@ -70,9 +70,9 @@ def verify_pairs(
     should_stop: Callable[[], bool] = lambda: False,
     up: Floats = Z,
 ) -> list[LoopCandidate]:
-    """The known pairs as candidates, verified wherever their scans may lie; an accepted one is held by the graph.
+    """The known pairs as candidates, verified whatever odometry says; accepted ones are binding for the graph.
 
-    Raises InterruptedRunError when `should_stop` said so between two.
+    Raises InterruptedRunError when `should_stop` returns True between two.
     """
     detector = _detector(store, store.keyframes, config, registration, submap_size, up=up)
     loops = []
@@ -108,7 +108,7 @@ def warm_up(config: LoopsConfig) -> None:
 
 
 def warm_up_candidates(config: LoopsConfig) -> Points:
-    """Compile or load the kernels by which candidates are found; the room (3000, 3), m, that serves for it."""
+    """Compile or load the kernels of candidate search; returns the synthetic room (3000, 3), m, used for it."""
     room = np.random.default_rng(0).uniform(-8, 8, (3000, 3)).astype(np.float32)
     room[np.arange(3000), np.arange(3000) % 3] = 8.0
     move_points(room, np.eye(4))

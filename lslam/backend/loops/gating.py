@@ -78,8 +78,8 @@ class OdometryUncertainty:
         return RelativeUncertainty(position, np.sqrt(square))
 
     def gate(self, b: int, among: Longs, least: float, near: float, sigmas: float) -> Longs:
-        """Those `among` the older keyframes (C,) at least `least` m of way ago and no farther from keyframe `b` than `near` m and
-        so many times the standard deviation of the position where it is worst (`RelativeUncertainty.reach`).
+        """Older keyframes, of `among` (C,), that may show the place of keyframe `b`: at least `least` m of travel before it, and
+        within `near` m or `sigmas` standard deviations of the position in its worst direction (`RelativeUncertainty.reach`).
         """
         covariances = np.zeros((0, 6, 6)) if self.covariances is None else self.covariances
         return np.asarray(
@@ -189,7 +189,7 @@ T = TypeVar("T")
 
 
 class SharedResults(Generic[T]):
-    """Results of a function of a number, the last used ones kept; who asks for one that another thread makes waits for it.
+    """Cache of a function of an integer for several threads; a thread that needs a result another is making waits for it.
 
     make : the function; size : how many results are kept, None for all
 
@@ -204,7 +204,7 @@ class SharedResults(Generic[T]):
         self._lock = threading.Lock()
 
     def get(self, number: int) -> T:
-        """The result for `number`; raises what making it raised."""
+        """The result for `number`; raises the exception that its computation raised."""
         with self._lock:
             future = self._made.get(number)
             result = Future() if future is None else future
@@ -227,10 +227,10 @@ LOOP_PLACES = 10
 
 
 class WorkingMemory:
-    """Places are keyframes in a row that look alike; so many of them are compared, the others lie in long-term memory.
+    """Places (runs of similar keyframes) to compare for loops; beyond a bound, the others are in long-term memory.
 
     A place enters when the run reaches it. Beyond the bound the place of least weight, of these the one that entered first, is
-    transferred to long-term memory. Weight is how many keyframes a place stands for (rehearsal); a verified loop gives the
+    transferred to long-term memory. Weight is the number of keyframes of a place (rehearsal); a verified loop gives the
     weight of the older place to the newer one. It also retrieves the neighbours of the older place, the nearest first.
 
     place_of : (K,) place of each keyframe, from 0 in steps of 0 or 1
@@ -256,9 +256,9 @@ class WorkingMemory:
         return len(self._members)
 
     def reach(self, keyframe: int) -> bool:
-        """Enter the place of `keyframe`, which comes next; retrieve neighbours of the last loop, transfer what is too much.
+        """Enter the place of `keyframe`, the next of the run; retrieve the last loop's neighbours, transfer the excess.
 
-        Whether that changed what `before` says.
+        Returns whether the keyframes that `before` returns changed.
         """
         place = int(self._place_of[keyframe])
         if self.bound is None or place == self._newest:
@@ -271,7 +271,7 @@ class WorkingMemory:
         return True
 
     def close(self, older: int, newer: int) -> None:
-        """Take a verified loop between two keyframes."""
+        """Record a verified loop between keyframes `older` and `newer`: weights move to the newer place."""
         if self.bound is None:
             return
         self._loop, place = int(self._place_of[older]), int(self._place_of[newer])
@@ -280,9 +280,9 @@ class WorkingMemory:
         self._weigh(self._loop, 0)
 
     def before(self, keyframe: int) -> Longs:
-        """Keyframes older than `keyframe`, increasing, that are compared with it.
+        """Keyframes older than `keyframe`, ascending, that are compared with it.
 
-        Places behind the newest one that was entered count, so that the memory can be asked about keyframes to come.
+        Keyframes after the newest entered place are included, so that `keyframe` may lie ahead of it.
         """
         if self.bound is None:
             return np.arange(keyframe)
@@ -302,6 +302,7 @@ class WorkingMemory:
         return self._weights[place], self._entered[place], place
 
     def _weigh(self, place: int, weight: int) -> None:
+        """Set the weight of `place` and keep the transfer order sorted."""
         at = bisect_left(self._order, self._key(place))
         is_member = at < len(self._order) and self._order[at] == self._key(place)
         if is_member:

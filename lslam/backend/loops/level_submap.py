@@ -30,7 +30,7 @@ ROUNDS = tuple(float(np.cos(np.deg2rad(limit))) for limit in (45.0, 30.0, 20.0, 
 def find_up(maps: Iterable[GaussianMap], prior: Floats = Z) -> Floats:
     """(3,) unit vector: the mean normal of nearly horizontal planes, with a tighter limit each round.
 
-    prior : (3,) unit vector, up by the mounting of the sensor, which the first round begins with and no plane leaves as it is
+    prior : (3,) unit vector, up by the mounting of the sensor: the initial guess, and the result where there is no plane
     """
     planes = [m.planes[m.planes[:, 7] >= 0, 3:6] for m in maps]
     normals = np.concatenate([*planes, np.zeros((0, 3))])
@@ -99,7 +99,7 @@ class LevelSubmap:
 def make_level_submap(points: Points, config: RegistrationConfig) -> LevelSubmap:
     """Prepare the points (N, 3), m, of a submap in level axes, z up.
 
-    Voxels with too few points for a Gaussian give no source points either.
+    Voxels with too few points for a Gaussian give no source points.
     """
     fine = GaussianMap(min(config.voxel_size, LARGEST), reach=np.inf, capacity=CAPACITY)
     for first in range(0, len(points), CAPACITY // 4):
@@ -252,7 +252,7 @@ class BestShifts:
 
 
 def peaks(shifts: Floats, score: Image, apart: float, most: int, nearly: float = 0.0) -> list[int]:
-    """Numbers of the best of the shifts (K, 2), m, by their score (K,): at most so many, none within `apart` m of another.
+    """Indices of the best of the shifts (K, 2), m, by score (K,), best first: at most `most`, none within `apart` m of another.
 
     nearly : least score as a part of the best
 

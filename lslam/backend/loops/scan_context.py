@@ -23,9 +23,9 @@ RINGS, SECTORS, REACH_M = 20, 60, 80.0
 
 
 def describe(points: NDArray[np.float32], rings: int, sectors: int, reach: float) -> Images:
-    """(rings, sectors) float32 heights over the ground, m, of points (N, 3) round the sensor, z up; 0 where none lies.
+    """(rings, sectors) float32 heights over the ground, m, of points (N, 3) round the sensor, z up; 0 in empty cells.
 
-    The ground is the lowest of what the cells hold, not the sensor's height, so that vehicles, drones and tilted sensors
+    The ground is the lowest of the cells' heights, not the sensor's height, so that vehicles, drones and tilted sensors
     all get the same image of a place.
     """
     image = polar_image(np.ascontiguousarray(points, np.float32), rings, sectors, reach)
@@ -40,7 +40,7 @@ def distances(query: Images, images: Images) -> Floats:
     """(C, S) distance of a query (R, S) to images (C, R, S) at each of S column shifts: mean of 1 - cos over the columns.
 
     Shift n compares column j of the query with column j + n (equations 2.36 and 2.37 of Girolimetto). Columns that
-    are empty in both say nothing; those empty in one only count as different.
+    are empty in both are ignored; those empty in only one count as different.
     """
     count = query.shape[1]
     q, q_seen = _unit_columns(query[None])
@@ -89,9 +89,9 @@ class PlaceIndex:
         self._keys[row] = self._images[row].mean(axis=1)
 
     def nearest(self, number: int, others: Longs, turn: float = np.pi) -> list[PlaceMatch]:
-        """Those of the keyframes `others` that look most like keyframe `number`, the best first; all must be known.
+        """Those of the keyframes `others` that are most similar to keyframe `number`, best first; all must have been added.
 
-        turn : rad, headings differ by no more
+        turn : rad, largest difference of heading
         """
         rows = np.array([self._rows[int(k)] for k in others], np.int64)
         if len(rows) == 0:

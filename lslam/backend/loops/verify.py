@@ -204,7 +204,7 @@ class Verifier:
         return self._agree(facts, forward, in_b.refine(a, se3.inverse(best.T_a_b)))
 
     def _judge(self, in_a: SubmapRegistration, in_b: SubmapRegistration, result: RegistrationResult) -> Verification:
-        """Tests of a registration by itself: degeneracy, rmse, overlap both ways."""
+        """Checks of one registration: degeneracy, rmse, overlap in both directions."""
         c = self.config
         if not result.ok or result.covariance is None:
             return Verification(LoopStage.REGISTRATION, result.reason or "nothing matches")
@@ -223,7 +223,7 @@ class Verifier:
         return facts.reject(stage, rejection.reason)
 
     def _agree(self, facts: Verification, forward: RegistrationResult, backward: RegistrationResult) -> Verification:
-        """Forward and backward must agree; their difference is added to the covariance of the loop closure."""
+        """Check that forward and backward registration agree; their difference is added to the covariance of the loop closure."""
         c = self.config
         if not backward.ok:
             return facts.reject(LoopStage.AGREEMENT, f"new to old: {backward.reason or 'nothing matches'}")

@@ -149,7 +149,7 @@ def peaks(grid: Floats, prior: Floats, count: int, is_round: bool) -> Floats:
 
 @inline
 def move(segment: Floats, pose: Floats) -> tuple[float, float, float, float]:
-    """End points x y x y, m, of a segment that is moved by a pose."""
+    """End points x y x y, m, of a segment (4,) of a moving frame, transformed by `pose` (3,) x, y, yaw."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
     return (
         pose[0] + c * segment[0] - s * segment[1],
