@@ -39,7 +39,7 @@ def create(config: Config) -> CtIcp:
 class CtIcp(Icp):
     """Two poses per scan; one where its points have no times, or as long as the speed is unknown.
 
-    Where an IMU felt the motion within the sweep the constraints hold to that, and its bend stays.
+    Where an IMU measured the motion within the sweep, the constraints refer to that, so that its curvature remains.
     """
 
     deskew = "within the registration, between a pose at the sweep's begin and one at its end"
@@ -76,7 +76,7 @@ class CtIcp(Icp):
 
 
 class LastSweep(Stateful):
-    """Remembers the last sweep, how well it was known, and how much the motion lately changed from scan to scan."""
+    """Stores the last sweep, its covariance, and how much the motion recently changed from scan to scan."""
 
     STATE = ("_ends_ns", "_ends", "_covariance", "_change", "_skew", "_skewed")
 
@@ -92,9 +92,9 @@ class LastSweep(Stateful):
         self._skewed: Floats | None = None
 
     def constraints(self, stamp_ns: int, prior: MotionPrior) -> ElasticConstraints:
-        """Of the scan at `stamp_ns`: it follows the last sweep at the same velocity, or as an IMU felt that it does.
+        """Constraints on the sweep of the scan at `stamp_ns`: it continues the last at its velocity, or as an IMU measured.
 
-        Where scans between are missing the prior says where it begins.
+        Where scans are missing in between, the prior defines its begin.
         """
         begin_ns, end_ns = _ends_ns(stamp_ns, prior)
         Q = noise.rotate(self._change_over(prior.span_s), prior.pose[:3, :3])
@@ -122,9 +122,9 @@ class LastSweep(Stateful):
         covariance: Floats,
         share: float,
     ) -> None:
-        """Take the `sweep` that was found for `prior`, its pose at the stamp now `pose` (4, 4).
+        """Store the registered `sweep`, its `prior`, and its pose (4, 4) at the stamp.
 
-        skew, covariance : as of `ElasticResult`; share : of the map that this scan is
+        skew, covariance : of `ElasticResult`; share : of the map that this scan contributes
         """
         self._ends_ns = _ends_ns(stamp_ns, sweep)
         self._ends = np.asarray(pose @ se3.relative(sweep.pose, sweep.poses[[0, -1]]))

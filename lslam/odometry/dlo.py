@@ -22,7 +22,7 @@ def create(config: Config) -> Dlo:
 
 
 class Dlo(Icp):
-    """Two registrations: against the last scan from the motion prior, then against the submap from what that found."""
+    """Two registrations: against the last scan from the motion prior, then against the submap from the first result."""
 
     STATE = (*Icp.STATE, "pairwise")
 
@@ -34,7 +34,7 @@ class Dlo(Icp):
     def register(
         self, scan: Scan, prepared: PreparedPoints, prior: MotionPrior, is_near: bool = False
     ) -> RegistrationResult:
-        """Align with the last scan, then with the submap."""
+        """Register the scan, deskewed by the prior, on the last scan and then on the submap; the result is that on the submap."""
         clock = StageClock()
         with clock.stage("deskew"):
             points = self.with_surfaces(deskew(prepared, prior), prepared)

@@ -84,11 +84,11 @@ NOTHING: Floats = np.zeros((6, 6))
 
 @dataclass(frozen=True)
 class ElasticConstraints:
-    """What is known of a sweep before its points are looked at; information (6, 6) in world axes.
+    """Prior information about a sweep, independent of its points; information matrices (6, 6) in world axes.
 
-    expected, location : where it begins, and of that; velocity : of the motion within it being that since the middle of the
-        last one; since : the sweep's part of the time since then
-    skew, skew_information : (6,) motion from begin to end that the sweeps lack which the map was made of, and of that
+    expected, location : its predicted begin, and the information on that; velocity : information that the velocity within
+        it equals that since the middle of the last one; since : the sweep's part of the time since then
+    skew, skew_information : (6,) motion from begin to end that the map's sweeps lack, and the information on that
     """
 
     expected: ElasticSweep
@@ -106,7 +106,7 @@ class ElasticConstraints:
         return cls(ElasticSweep.of(prior), NOTHING, inverse(prior.change), 0.0, np.zeros(6), fixed)
 
     def add_to(self, A: Floats, b: Floats, sweep: ElasticSweep) -> None:
-        """Add all to the normal equations (18, 18), (18,) of begin, end and skew, in place.
+        """Add all constraints to the normal equations (18, 18), (18,) of begin, end and skew, in place.
 
         Location consistency and constant velocity: Dellenbach et al. 2022, section III-B.
         """
@@ -146,7 +146,7 @@ class ElasticResult:
 
 
 class SweepPoints:
-    """Source points in the order of their times, in `SWEEP_PARTS` parts that share the map's levels but no correspondence."""
+    """Source points sorted by time, in `SWEEP_PARTS` parts that share the map's levels but have correspondences of their own."""
 
     def __init__(self, points: PreparedPoints, levels: Sequence[GaussianMap], sigma: float) -> None:
         assert points.source_times is not None
@@ -191,10 +191,10 @@ class SweepPoints:
 def register_elastic(
     points: SweepPoints, start: ElasticSweep, constraints: ElasticConstraints, annealing: Annealing, weak_share: float
 ) -> ElasticResult:
-    """Both poses of a sweep by annealed Gauss-Newton, the points placed anew at their own times in every step.
+    """Both poses of a sweep by annealed Gauss-Newton; each step places the points anew at their own times.
 
-    The pose at the stamp has the rotation's and translation's share of both ends; degenerate is what holds the sweep as a
-    whole too little.
+    The pose at the stamp is interpolated between both ends. Degenerate directions are those of the sweep as a rigid whole.
+    Fewer than `MIN_MATCHES` matches end the iteration: the result is then not ok.
     """
     scale, iterations, converged, d, skew = annealing.start, 0, False, np.zeros((2, 6)), np.zeros((1, 6))
     sweep, shares = start, points.shares(start)

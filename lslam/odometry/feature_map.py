@@ -101,9 +101,9 @@ def to_arrays(features: Features) -> Features:
 
 
 def _normals(points: Floats) -> Floats:
-    """(N, 3) normals of the surfaces around points (N, 3), zero where none is found.
+    """(N, 3) unit normals of the surfaces around points (N, 3), zero where there is none.
 
-    Voxels of half the reach tell them, and before these voxels twice as large, for two rings of a sparse sensor.
+    They come from voxels of twice half the reach, where there are, for two rings of a sparse sensor; else from half the reach.
     """
     capacity = 1 << max(8, int(np.ceil(np.log2(len(points) + 1))))
     fine, normals = GaussianMap(MATCH_REACH_M / 2, capacity=capacity, reach=np.inf), np.zeros_like(points)

@@ -24,7 +24,7 @@ CONSTRAINED_SCANS = 20
 
 
 class AllPoints(Stateful):
-    """A map of all points, kept while it is needed.
+    """A local map of all points with its own `icp`, maintained only while features are poorly constrained.
 
     voxel_size : m, of that map
     """
@@ -61,8 +61,8 @@ class AllPoints(Stateful):
     ) -> RegistrationResult:
         """The pose by `icp` on a map of all points, unless it fails; directions degenerate by features stay flagged.
 
-        Few rings at speed leave so few features that one outlier misleads them by metres.
-        own : the result of `locate`, if there is one already
+        Few rings at speed give so few features that one outlier displaces the pose by metres.
+        own : the result of `icp` on that map, if it was computed already
         """
         if self._fed >= CONSTRAINED_SCANS:
             self._icp = self._of_recent(attempt.history)
@@ -78,7 +78,7 @@ class AllPoints(Stateful):
         )
 
     def enter(self, result: RegistrationResult) -> None:
-        """While it is needed, enter a scan into the map, and adapt `icp` by its own result of the scan, if there is one."""
+        """Insert a registered scan into the map of all points, while that is in use (`CONSTRAINED_SCANS` scans after each use)."""
         if self._fed >= CONSTRAINED_SCANS:
             return
         self._fed += 1
@@ -111,7 +111,7 @@ class LessPlanar:
     name = "less planar points"
 
     def recover(self, attempt: Attempt, result: RegistrationResult) -> RegistrationResult:
-        """Acts on results that fail, have few inliers, or are degenerate on a map."""
+        """Register less planar points where the result fails, has few inliers, or is degenerate on a map; else return `result`."""
         target, are_few = attempt.target, result.inliers < MIN_FEATURES
         is_degenerate = len(result.degenerate) > 0 and target.map is not None
         if result.ok and not are_few and not is_degenerate:
@@ -130,10 +130,10 @@ class LessPlanar:
 
 
 class SolutionRemapping:
-    """The motion prior along degenerate directions."""
+    """Replaces the pose along degenerate directions by the motion prior (solution remapping, Zhang 2016)."""
 
     def recover(self, attempt: Attempt, result: RegistrationResult) -> RegistrationResult:
-        """Acts on degenerate results."""
+        """The result with its degenerate directions remapped, checked again; other results as they are."""
         if not (result.ok and len(result.degenerate)):
             return result
         # The first step's prior is a guess, which the search has replaced.
@@ -146,7 +146,7 @@ class AllPointsInstead:
     """`icp` on all points of the scan, where they contradict the features or constrain a poorly constrained pose."""
 
     def recover(self, attempt: Attempt, result: RegistrationResult) -> RegistrationResult:
-        """Acts at the start, on results far from their prior, and on poorly constrained ones."""
+        """Register all points at the start, far from the prior or if poorly constrained; that result, if different, replaces it."""
         points, c = attempt.target.all_points, attempt.config
         if points is None:
             return result

@@ -50,7 +50,7 @@ class FeatureNoise:
 class ScanMatching:
     """An earlier scan, and how features are aligned with it.
 
-    one_to_many : whether a feature is matched with several of the earlier scan, a line or a plane through them
+    one_to_many : whether a feature is matched with several points of the earlier scan, by the line or plane through them
     """
 
     target: FeatureScan
@@ -101,9 +101,9 @@ def solve_on_map(
     """Align edges (E, 3) and planar points (P, 3), LiDAR frame, with the feature map, starting at `T_prior` (4, 4).
 
     scatter : (P, 6) m2, of the points behind each planar point when that is a centroid
-    levels : of the map's planes, the finest first, each for the points without a plane in those before; None takes all
-    inlier_ratio : share of the correspondences, the nearest, that have a say from the second step on
-    information : (6, 6) of the start as a prior beside the features; None: it is only a start
+    levels : voxel sizes of the map's planes, finest first, each for points without a plane in finer ones; None: all
+    inlier_ratio : share of the correspondences, the closest ones, that are used from the second step on
+    information : (6, 6) of the start as a prior besides the features; None: it is only the initial guess
     """
     if scatter is None:
         scatter = np.zeros((len(planes), 6))
@@ -145,8 +145,8 @@ def joint_step(matching: ScanMatching, features: Features, T_prior: Floats, cloc
 def two_steps(matching: ScanMatching, features: Features, T_prior: Floats, clock: StageClock) -> RegistrationResult:
     """z, roll and pitch from planar points, stage `ground`; then x, y and yaw from edges, stage `edges`.
 
-    LeGO-LOAM (Shan and Englot 2018), section IV-D. Axes are the sensor's at the prior. The covariance joins the two:
-    each step is blind in the other's directions.
+    LeGO-LOAM (Shan and Englot 2018), section IV-D. Axes are the sensor's at the prior. The covariance joins the two, since
+    each step does not observe the other's directions.
     """
     upright = upright_directions(T_prior)
     with clock.stage("ground"):

@@ -67,7 +67,7 @@ class LoamVariant:
 
 
 class FeatureTarget(Target):
-    """The last scan's features and the feature map; `icp` on all points beside them, where the configuration falls back on it."""
+    """The target of LOAM: the last scan's features, the feature map, and, if the configuration falls back on it, all points."""
 
     source = "features"
     times_steps = 1
@@ -115,8 +115,7 @@ class FeatureTarget(Target):
     ) -> RegistrationResult:
         """Align with the scan before and, from there, with the feature map, from `T_start` (4, 4).
 
-        About a prior that is nearly right, that stays along degenerate directions. `information` (6, 6) of the start joins the
-        features of the map.
+        The pose does not move along degenerate directions. `information` (6, 6) of the start joins the features of the map.
         """
         assert self.scan is not None
         features, noise, iterations, c = attempt.points, self.noise(attempt.history), 0, self.config
@@ -165,7 +164,7 @@ class FeatureTarget(Target):
         return attempt.judge(solve_on_map(self._planes(), edges, points, T_start, annealing, noise, scatter=scatter))
 
     def enter(self, result: RegistrationResult) -> None:
-        """Into the feature map, and as what the next scan is registered on."""
+        """Insert the registered features into the map; they become the last scan for the next registration."""
         features, T_world_lidar = to_arrays(result.points), result.T_world_lidar
         if self.map is not None and self._keyframes is not None:
             self._keyframes.enter(self.map, features, T_world_lidar)
@@ -180,7 +179,7 @@ class FeatureTarget(Target):
         return points.cloud
 
     def _start(self, attempt: Attempt) -> RegistrationResult:
-        """A start that is metres nearer, where the prior may be metres off: less planar points on coarse planes."""
+        """An initial guess for a prior that may be metres off: less planar points registered on coarse planes."""
         c, history, T_prior = self.config, attempt.history, attempt.T_prior
         if self.all_points is not None and attempt.is_young:
             return self.all_points.locate(attempt)
@@ -210,7 +209,7 @@ class FeatureTarget(Target):
         return trials[int(np.argmax(agree))] if is_clear else result
 
     def _planes(self) -> FeatureMap:
-        """The feature map, or one made of the last scan alone."""
+        """The feature map; without one, a map of the last scan alone."""
         if self.map is not None and len(self.map):
             return self.map
         assert self.scan is not None

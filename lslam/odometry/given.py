@@ -29,7 +29,7 @@ GAP_STEPS, GAP_S = 2.5, 0.25
 
 
 class GivenMotion(Stateful, MotionModel):
-    """Reads the motion off a trajectory."""
+    """Motion model that interpolates the poses of a trajectory."""
 
     def __init__(self, trajectory: Trajectory) -> None:
         self.trajectory = trajectory
@@ -42,7 +42,7 @@ class GivenMotion(Stateful, MotionModel):
         return True
 
     def covers(self, stamp_ns: int) -> bool:
-        """Whether the trajectory has poses about that instant."""
+        """Whether the trajectory has poses before and after the stamp, without a gap, or one within a millisecond."""
         stamps = self.trajectory.stamps_ns
         right = int(np.searchsorted(stamps, stamp_ns))
         if right < len(stamps) and stamps[right] == stamp_ns:
@@ -73,7 +73,7 @@ class GivenMotion(Stateful, MotionModel):
 
 
 class GivenPoses(Traits, Stateful):
-    """Scan by scan the pose of a trajectory, which has to be of the LiDAR: `pipeline.job.bind` sees to it."""
+    """Takes each scan's pose from a trajectory, which has to be of the LiDAR (`pipeline.job.bind` ensures that)."""
 
     deskew = "by the motion of the given trajectory"
     ignores_prior = True

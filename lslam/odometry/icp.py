@@ -24,10 +24,9 @@ from lslam.registration.voxel_target import MIN_SOURCE_POINTS
 
 
 def create(config: Config) -> Icp:
-    """The method as the configuration wants it.
+    """The method `icp` with the configured residual, or one named after its residual, with or without the prefix `icp-`.
 
-    `icp` takes any residual; the others are named after theirs, with or without `icp-` before it. Raises UsageError when
-    one is asked for another.
+    Raises UsageError when `registration.residual` is another one.
     """
     method, configured = config.odometry.method, config.registration.residual
     name = method.removeprefix("icp-")
@@ -52,7 +51,7 @@ def registration_of(
 
 
 class Icp(MapMethod):
-    """Points on the local map."""
+    """Registers points on the local map."""
 
     deskew = "by the motion prior, and again by the motion that registration finds"
     TRANSIENT: ClassVar[tuple[str, ...]] = ("_surfaces",)
@@ -73,7 +72,7 @@ class Icp(MapMethod):
     def register(
         self, scan: Scan, prepared: PreparedPoints, prior: MotionPrior, is_near: bool = False
     ) -> RegistrationResult:
-        """Align with the local map, elastically where later scans told the motion as well."""
+        """Deskew by the prior and register on the local map; elastically where the motion comes from a window's course."""
         if prior.change is not None and self.is_elastic(prepared, prior):
             return self.register_sweep(prepared, ElasticConstraints.of_course(prior), prior, is_near)
         began = time.perf_counter()
@@ -87,9 +86,9 @@ class Icp(MapMethod):
         return replace(result, map_age=self.map_age, stages=stages)
 
     def with_surfaces(self, points: PreparedPoints, prepared: PreparedPoints) -> PreparedPoints:
-        """The deskewed points with the covariances of the surfaces that they lie on, where the residual takes them.
+        """The deskewed points with the covariances of their surfaces, if the residual needs them.
 
-        A sweep that is deskewed again keeps those of the first time: what is left of its motion moves neighbours alike.
+        A sweep that is deskewed again keeps the first covariances: the rest of its motion moves neighbours alike.
         """
         target = self.registration.target
         if not target.kind.needs_covariance:
@@ -106,7 +105,7 @@ class Icp(MapMethod):
     def register_sweep(
         self, prepared: PreparedPoints, constraints: ElasticConstraints, prior: MotionPrior, is_near: bool
     ) -> RegistrationResult:
-        """Both poses of the sweep."""
+        """Register begin and end pose of the sweep (elastic registration), and deskew by them; by the prior if that fails."""
         began, registration = time.perf_counter(), self.registration
         attempt, c = registration.attempt(prepared, prior.pose, is_near), registration.config
         points = SweepPoints(prepared, registration.map.levels, c.sigma)

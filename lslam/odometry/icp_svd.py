@@ -53,11 +53,11 @@ def create(config: Config) -> IcpSvd:
 
 
 class IcpSvd(Traits, Stateful):
-    """Nearest neighbours, trimmed, then the transform that fits them best, until it no longer changes.
+    """Nearest neighbours, trimmed, then the best-fitting transform, iterated until it no longer changes.
 
-    Of `registration` it takes `inlier_ratio`, `inlier_distance`, `max_iterations` and the limits beyond which a result is
-    not accepted; it gives no covariance. It follows the sensor's start only when that is slow, and on sparse rings it lags:
-    a ring's nearest neighbour is the ring of the scan before. Trimming makes that worse.
+    It uses `registration.inlier_ratio`, `inlier_distance`, `max_iterations` and the acceptance limits; it gives no covariance.
+    It follows the sensor's start only when that is slow, and lags with sparse rings, since a ring's nearest neighbour is the
+    same ring of the scan before. Trimming makes that worse.
     """
 
     STATE = ("_last", "_failed")
@@ -72,7 +72,7 @@ class IcpSvd(Traits, Stateful):
         return prepare_points(scan.points, self._preprocess, scan.index)
 
     def register(self, scan: Scan, prepared: PreparedPoints, prior: MotionPrior) -> ScanResult:
-        """Align with the last scan that was registered; after two failures in a row this scan takes its place."""
+        """Align with the last registered scan; after two failures in a row this scan replaces that."""
         began = time.perf_counter()
         c = self._config
         if self._last is None or len(prepared.source) < MIN_SOURCE_POINTS:
@@ -112,9 +112,9 @@ def align_closed_form(
 ) -> RegistrationResult:
     """Pose of the source points (S, 3), m, LiDAR frame, by equations 2.17 to 2.20 of Girolimetto.
 
-    Each round pairs every point with its nearest in the last scan, keeps the pairs within `inlier_distance`, m (None: those
-    the X84 rule does not call outliers), of these the nearest `inlier_ratio`, and takes the transform of least squares:
-    centroids removed (2.18, 2.19), rotation by SVD of the covariance (2.20).
+    Each round pairs every point with its nearest in the last scan, keeps the pairs within `inlier_distance`, m (None: the
+    inliers of the X84 rule), of these the closest `inlier_ratio`, and computes the least-squares transform:
+    centroids removed (2.18, 2.19), rotation by SVD of the covariance (2.20). Not converged where the pairs do not determine it.
     """
     T = se3.relative(last.T_world_lidar, T_prior)
     converged, rounds, near = False, 0, np.zeros(0, np.int64)
@@ -143,7 +143,7 @@ def align_closed_form(
 
 
 def keep_pairs(distance: Floats, inlier_ratio: float, inlier_distance: float | None) -> Longs:
-    """Indices of the inlier pairs by their distance (S,), m, infinite where there is none; increasing."""
+    """Indices (ascending) of the inlier pairs by their distances (S,), m, infinite where a point has no partner."""
     near = np.flatnonzero(np.isfinite(distance))
     if inlier_distance is None and len(near):
         middle = float(np.median(distance[near]))

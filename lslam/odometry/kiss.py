@@ -28,10 +28,10 @@ def create(config: Config) -> Kiss:
 
 
 class Kiss(Traits):
-    """kiss-icp as its authors run it: it predicts, deskews and down-samples by itself and ignores the motion prior.
+    """Runs kiss-icp with its authors' settings: it predicts, deskews and down-samples by itself and ignores the motion prior.
 
-    kiss-icp's pose belongs to the scan's end when it deskews: it is carried back to the scan's stamp. Compensated scans
-    have one instant and are left alone.
+    With deskewing, kiss-icp's pose is that of the scan's end: it is moved to the scan's stamp. Compensated scans
+    have one instant and are not moved.
     """
 
     deskew = "by kiss-icp, in scans that have per-point times"
@@ -56,7 +56,7 @@ class Kiss(Traits):
         self._T_world_kiss = np.eye(4)
 
     def prepare(self, scan: Scan) -> tuple[Any, Any]:
-        """Points as float64 and their times scaled to 0..1 as kiss-icp wants them."""
+        """Finite points (N, 3) as float64, and their times scaled to 0..1; no times if the scan has none."""
         if self._taking_out is not None:
             scan = scan.select(gate_points(scan.points, self._taking_out))
         finite = np.isfinite(scan.points).all(axis=1)
@@ -68,7 +68,7 @@ class Kiss(Traits):
         return points, (times - times.min()) / span if span > 0 else np.zeros(0)
 
     def register(self, scan: Scan, prepared: tuple[Any, Any], prior: MotionPrior) -> ScanResult:
-        """One kiss-icp frame."""
+        """Register one scan by kiss-icp; `bridged` by the prior where too few points are in its range."""
         points, times = prepared
         # Of a scan without points in its range the package says its own prediction, and nothing else.
         usable = int((np.einsum("ij,ij->i", points, points) < self._config.data.max_range**2).sum())
@@ -90,10 +90,10 @@ class Kiss(Traits):
         return ScanResult(scan.index, scan.stamp_ns, pose, source_points=len(source), stages={"register": took})
 
     def _at_stamp(self, pose: Floats, delta: Floats, share: float) -> Floats:
-        """Pose at the scan's stamp, when the share `passed` of its sweep is over, in the world of the first scan's stamp.
+        """Pose at the scan's stamp, at `share` (0..1) of its sweep, in the world of the first scan's stamp.
 
         `pose` is kiss-icp's newest, `delta` its motion since the one before: the start of a scan is the end of the one
-        before. But kiss-icp knows no motion to deskew its first two scans with: their poses belong to the middle, and there
+        before. But kiss-icp has no motion to deskew its first two scans: their poses belong to the middle, and there
         its world begins.
         """
         self._registered += 1

@@ -28,10 +28,10 @@ create_motion = WindowMotion
 
 
 class LioMapping(FastLio2):
-    """Registers a scan with the window's prediction in one estimate, and takes its normal equations where that ends.
+    """Registers a scan with the window's prediction in one estimate, and linearises its points at the result.
 
     The joint estimate is the motion model's (`lslam.odometry.inertial.window`), the map is of the scans that left it: each enters
-    when it is `lag` scans old, at the last pose the window gave it, and is never compared with a map that it is part of.
+    when it is `lag` scans old, at the last pose of the window, and is never compared with a map that contains it.
     """
 
     deskew = "by the prediction of the window"
@@ -70,7 +70,7 @@ class LioMapping(FastLio2):
         return ScanEquations(stamp_ns, T, *normal_equations(problem.terms, T, width, problem.matches))
 
     def insert(self, stamp_ns: int, prior: MotionPrior, result: RegistrationResult) -> RegistrationResult:
-        """Keep the scan for the map; while that is young, or the window silent, it enters at once."""
+        """Queue the scan for the map; it enters at once while the map has few scans or the window is not running."""
         if not result.ok or prior.covariance is None or self.registration.history.is_young:
             return self.registration.update(result)
         result = self.registration.rest_detector.judge(result)
@@ -79,7 +79,7 @@ class LioMapping(FastLio2):
         return result
 
     def settle(self, poses: Mapping[int, Floats]) -> None:
-        """Move the scans that wait to the poses (4, 4) of the window; those old enough, or no longer in it, enter the map."""
+        """Set the queued scans to the window's poses (4, 4), by stamp; those old enough, or no longer in it, enter the map."""
         waiting = [(stamp_ns, points, poses.get(stamp_ns, T), rests) for stamp_ns, points, T, rests in self.pending]
         due = [k < len(waiting) - self.lag or one[0] not in poses for k, one in enumerate(waiting)]
         for (_, points, T, rests), is_due in zip(waiting, due, strict=True):

@@ -52,7 +52,7 @@ BRAKING_M_S2 = 3.0
 
 
 class LinkedMotion(FilterMotion):
-    """Predicts and deskews as the filter does; the estimate itself is the smoother's, of all states it holds."""
+    """Predicts and deskews as the filter does; its states come from the smoother of the method, through `fuse`."""
 
     HAS_DEVICE: ClassVar[bool] = False
     STATE: ClassVar[tuple[str, ...]] = (*FilterMotion.STATE, "_last_link")
@@ -77,7 +77,7 @@ class LinkedMotion(FilterMotion):
         return False
 
     def fuse(self, stamp_ns: int, result: RegistrationResult, prior: MotionPrior) -> RegistrationResult:
-        """The result as it is; the states of the smoother are kept for `correct`."""
+        """Return the result without `inertial`, the smoother's state, which is stored for `correct`."""
         self._posterior = None
         if result.inertial is not None and prior.link is not None:
             middle, instant_ns = middle_of(prior, stamp_ns, result.T_world_lidar)
@@ -94,7 +94,7 @@ class LinkedMotion(FilterMotion):
             self._last_link = self._last_link[0], self._pose.copy()
 
     def rewind(self, stamp_ns: int, pose: Floats, span: Span) -> MotionPrior:
-        """As of any IMU; the smoother begins anew, too."""
+        """Forget all scans but the first, as `InertialMotion.rewind`; the returned motion begins a new smoother."""
         self._now = self._next = self._posterior = None
         prior = super().rewind(stamp_ns, pose, span)
         assert self._instant_ns is not None
@@ -103,6 +103,7 @@ class LinkedMotion(FilterMotion):
         return replace(prior, link=SweepLink(self.T_lidar_imu, se3.relative(pose, self._pose), _plain(state)))
 
     def _link(self, prior: MotionPrior, stamp_ns: int) -> SweepLink:
+        """The link of the sweep to the state before, by the IMU or, in gaps and after standstill, by the predicted motion."""
         middle, instant_ns = middle_of(prior, stamp_ns, prior.pose)
         T_world_imu = middle @ self.T_lidar_imu
         # Where a smoother begins; no filter had a state there.
@@ -134,7 +135,7 @@ def _plain(state: NavigationState) -> MotionState:
 
 
 def _from_imu(e: ImuEstimate, step: Increments, R: Floats) -> PreintegratedStep:
-    """What the IMU felt, as the estimate integrated it; R : (3, 3) of the IMU in the world at the first instant."""
+    """The preintegrated IMU readings of `step` with covariance; R : (3, 3) of the IMU in the world at its first instant."""
     t = step.duration
     C = process_noise(t, e.gyroscope.rate_variance, e.gyroscope.noise)
     if step.hidden is not None:
@@ -155,7 +156,7 @@ def _from_imu(e: ImuEstimate, step: Increments, R: Floats) -> PreintegratedStep:
 
 
 def _coast(e: ImuEstimate, motion: Floats, seconds: float) -> PreintegratedStep:
-    """The motion (4, 4) of the IMU that is expected over a gap, after it stood, or after the IMU was refused."""
+    """A step by the predicted motion (4, 4) of the IMU over `seconds`, for gaps, after standstill and after refusal of the IMU."""
     walk = e.gyroscope.noise
     sigmas = BRAKING_M_S2 * seconds, walk.accel_walk * seconds**0.5, walk.gyro_walk * seconds**0.5
     C = np.diag(np.repeat([0.0, 0.0, *np.square(sigmas)], 3))
@@ -242,7 +243,7 @@ class Lips(Traits, Stateful):
         )
 
     def update(self, scan: Scan, prior: MotionPrior, result: RegistrationResult) -> ScanResult:
-        """The window goes on with the scan's planes, or without them where its result is rejected."""
+        """Adopt the window with the scan's planes, or without them where the result is rejected."""
         began = time.perf_counter()
         window, predicted, covariance = result.detail
         if not result.is_accepted:
@@ -268,7 +269,7 @@ class Lips(Traits, Stateful):
         return self.window.extend(link.step)
 
     def _result(self, link: SweepLink, window: PlaneWindow, planes: Planes, matches: Longs) -> RegistrationResult:
-        """The newest pose with its covariance on the planes; the detail is that in the world."""
+        """The registration result: the newest pose with its covariance relative to the planes; `detail` is that in the world."""
         pose = se3.normalise(window.T_world_lidar @ se3.inverse(link.within))
         P = window.joint_covariance()
         which = np.flatnonzero(matches >= 0)
@@ -289,7 +290,7 @@ class Lips(Traits, Stateful):
         )
 
     def _degenerate(self, window: PlaneWindow, matches: Longs) -> Floats:
-        """(D, 6) twists of the LiDAR along which the known planes of the scan say next to nothing."""
+        """(D, 6) twists of the LiDAR that the scan's known planes hardly constrain."""
         if window.values.states == 1:
             return np.zeros((0, 6))  # the first scan begins the world
         is_of_known_planes = (window.sightings.states == window.values.states - 1) & np.isin(
@@ -303,7 +304,7 @@ class Lips(Traits, Stateful):
 
 
 def _refusal(window: PlaneWindow, planes: Planes, matches: Longs) -> str:
-    """Why a scan's planes are rejected; empty where they are not."""
+    """Reason to reject a scan's planes: none, or too few of their points on known planes; empty if they are accepted."""
     if len(planes) == 0:
         return "no plane is seen: the IMU carries the scan"
     if len(window.landmarks) == 0:

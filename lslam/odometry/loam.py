@@ -36,7 +36,7 @@ def create(config: Config) -> Loam:
 
 
 class Loam(MapMethod):
-    """Edges and planar points on the scan before, on the feature map, or on one after the other."""
+    """Registers edges and planar points on the last scan, on the feature map, or on one after the other."""
 
     needs_rings = True
     deskew = "features by the motion prior, and again by the motion that registration finds"
@@ -63,7 +63,7 @@ class Loam(MapMethod):
         return self.config.preprocess.deskew and prepared.planes.times is not None and len(motion.times) > 1
 
     def register(self, scan: Scan, prepared: Features, prior: MotionPrior, is_near: bool = False) -> RegistrationResult:
-        """Align with the scan before, with the feature map, or with one after the other."""
+        """Register features on the last scan, on the feature map, or on one after the other, as the variant says."""
         clock = StageClock()
         with clock.stage("deskew"):
             features = self.features_of(prepared, prior)
@@ -73,7 +73,7 @@ class Loam(MapMethod):
         return replace(result, map_age=self.map_age, stages=clock.seconds)
 
     def warm_up(self) -> None:
-        """Register a small room with a throw-away copy, well and badly: every kernel is compiled or loaded."""
+        """Compile or load every kernel by registering a synthetic room with a temporary copy, from a good and a bad start."""
         trial = type(self)(self.config, self.variant)
         room = _room()
         prior = MotionPrior.at_once(np.eye(4))
@@ -144,7 +144,7 @@ class _SweepPart(FeaturePoints):
 
 
 def _room() -> Scan:
-    """Sixteen rings in a box of a room with four corners, as a sensor in its middle sees it."""
+    """Synthetic scan of 16 rings, from the middle of a box-shaped room."""
     azimuth, elevation = np.linspace(-np.pi, np.pi, 900, endpoint=False), np.linspace(-0.3, 0.3, 16)
     a, e = np.meshgrid(azimuth, elevation)
     beams = np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], axis=-1).reshape(-1, 3)

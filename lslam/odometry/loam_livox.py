@@ -32,7 +32,7 @@ def create(config: Config) -> LoamLivox:
 
 
 class LoamLivox(Loam):
-    """Each piece of a sweep is registered on the feature map by itself; the motion within the sweep follows from them."""
+    """Registers each piece of a sweep on the feature map by itself; the motion within the sweep follows from them."""
 
     deskew = "by the pieces of a sweep, each of them by the motion prior"
 
@@ -50,7 +50,7 @@ class LoamLivox(Loam):
         return petal_features(scan, self.config.loam, self.config.preprocess)
 
     def register(self, scan: Scan, prepared: Features, prior: MotionPrior, is_near: bool = False) -> RegistrationResult:
-        """Piece after piece; at once where the sweep takes no time."""
+        """Register piece after piece, each from the pose of the last; as a whole if the sweep takes no time."""
         count = self.config.loam.pieces
         if is_near or count < 2 or len(self.registration.target) == 0 or not self.has_sweep(prepared, prior):
             return super().register(scan, prepared, prior, is_near)
@@ -85,11 +85,11 @@ def between(features: Features, begin: float, end: float) -> Features:
 def join(
     pieces: list[RegistrationResult], middles: Floats, prior: MotionPrior
 ) -> tuple[RegistrationResult, MotionPrior]:
-    """The registrations of the pieces as one of the scan, and the motion over its sweep.
+    """The registrations of the pieces as one result of the scan, and the motion over its sweep.
 
-    Each of them says where the sensor was at the stamp, had it moved as the prior says. Their differences are a motion that
-    the prior does not know, and noise: the sweep moves by the line through them, drawn by least squares and followed by
-    `SLOPE_SHARE` of its slope. A scan has failed when half of its pieces have.
+    Each piece estimates the pose at the stamp, assuming the prior's motion. Their differences are unpredicted motion and noise:
+    the sweep is corrected by a least-squares line through them, with `SLOPE_SHARE` of its slope. A scan fails when half
+    of its pieces do.
 
     middles : s from the stamp
     """

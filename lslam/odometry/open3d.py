@@ -43,7 +43,7 @@ def create(config: Config) -> Open3dGicp:
 
 
 class Open3dGicp(Traits):
-    """Open3D's generalised ICP (Segal 2009) with its own defaults. It keeps no map: its drift adds up scan by scan."""
+    """Open3D's generalised ICP (Segal 2009) with its own defaults. It has no map, so its drift adds up scan by scan."""
 
     def __init__(self, preprocess: PreprocessConfig, limits: RegistrationConfig) -> None:
         with importing_open3d():
@@ -62,7 +62,7 @@ class Open3dGicp(Traits):
         return cloud
 
     def register(self, scan: Scan, prepared: Any, prior: MotionPrior) -> ScanResult:
-        """Align with the last scan that was registered."""
+        """Align with the last registered scan; `bridged` by the prior where that is rejected."""
         began = time.perf_counter()
         alignment = self._align(prepared, prior.pose)
         result = judge(scan, alignment, prior.pose, self._limits, {})
@@ -72,6 +72,7 @@ class Open3dGicp(Traits):
         return result
 
     def _align(self, cloud: Any, T_prior: Floats) -> RegistrationResult:
+        """Align the cloud with the last registered scan by Open3D; the prior itself without one."""
         count = len(cloud.points)
         if self._last is None or count < MIN_SOURCE_POINTS:
             return RegistrationResult(T_prior, source_points=count, inliers=count)

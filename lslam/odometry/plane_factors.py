@@ -37,7 +37,7 @@ class WindowValues:
 
     @classmethod
     def begin(cls, state: MotionState) -> WindowValues:
-        """One state and no planes."""
+        """Values of one state and no planes."""
         return cls(
             state.gravity,
             state.gyro_axes,
@@ -78,7 +78,7 @@ class WindowValues:
         )
 
     def since(self, before: WindowValues) -> Floats:
-        """(N,) the update that leads here from values `before` of as many states and planes."""
+        """(N,) update that leads from the values `before`, of as many states and planes, to these."""
         turn = so3.log(self.poses[:, :3, :3] @ np.swapaxes(before.poses[:, :3, :3], 1, 2))
         x = np.concatenate(
             [
@@ -100,7 +100,7 @@ class WindowValues:
         )
 
     def select(self, states: slice, planes: slice | Bools = slice(None)) -> WindowValues:
-        """Some of the states and planes."""
+        """The values of some of the states and planes."""
         return replace(
             self,
             poses=self.poses[states],
@@ -158,7 +158,7 @@ class Sightings:
         return Sightings(self.states[which], self.planes[which], self.cp[which], self.information[which])
 
     def join(self, more: Sightings) -> Sightings:
-        """These and `more`."""
+        """These sightings and `more`."""
         return Sightings(
             *(
                 np.concatenate([getattr(self, name), getattr(more, name)])
@@ -168,7 +168,7 @@ class Sightings:
 
 
 def step_residual(values: WindowValues, k: int, step: PreintegratedStep) -> tuple[Floats, Floats]:
-    """What state k + 1 is off from where `step` leads from state k.
+    """Residual of state k + 1 relative to the prediction by `step` from state k, and its Jacobian.
 
     Returns
     -------
@@ -230,7 +230,7 @@ def normal_equations(
     anchors: Floats,
     T_imu_lidar: Floats,
 ) -> Normal:
-    """All factors at `values`; the prior is on the first state."""
+    """Normal equations of all factors at `values`; `prior` is on the first state and the planes, sightings have Huber weights."""
     H, g = np.zeros((values.size, values.size)), np.zeros(values.size)
     first = np.r_[0 : SHARED + STATE_SIZE, values.first_plane : values.size]
     pull = np.einsum("ij,j->i", prior.information, values.select(slice(1)).since(prior.at)) + prior.gradient

@@ -126,10 +126,10 @@ class Planes:
 
 
 class PlaneExtractor:
-    """Extracts planes, scan after scan, in voxels of which only the room is kept.
+    """Extracts the planes of one scan after another; only the allocated voxel memory is reused.
 
-    sigma : m, noise of a point; no plane is taken for better
-    common_m, common_rad : by which all points of a plane are off together
+    sigma : m, noise of a point, lower bound of a plane's
+    common_m, common_rad : one sigma of the error that all points of a plane share
     """
 
     def __init__(
@@ -146,7 +146,7 @@ class PlaneExtractor:
         )
 
     def extract(self, points: NDArray[np.float32]) -> Planes:
-        """Planes of points (N, 3), m, LiDAR frame, without motion in them; the surest seeds come first."""
+        """Planes of deskewed points (N, 3), m, LiDAR frame; grown from the most certain seeds first."""
         voxels = self._voxels
         voxels.clear()
         voxels.insert(points, np.eye(4))
@@ -164,6 +164,7 @@ class PlaneExtractor:
         return Planes(*(np.stack(column) for column in zip(*regions, strict=True)))
 
     def _regions(self, cells: _Cells, sizes: list[_Seeds]) -> list[tuple[Floats, ...]]:
+        """Planes grown from seeds of increasing voxel size, over voxels that no plane has yet; at most `MOST_PLANES`."""
         free, regions = np.ones(len(cells.means), bool), list[tuple[Floats, ...]]()
         trials = 0
         for seeds in sizes:
@@ -245,6 +246,7 @@ class _Cells:
 
     @classmethod
     def of(cls, voxels: GaussianMap, slots: Longs) -> _Cells:
+        """The cells of the voxels in `slots`, neighbours being those whose means lie within `TOUCHING_M`."""
         from scipy.sparse import csr_matrix
         from scipy.spatial import cKDTree
 
@@ -261,7 +263,7 @@ class _Cells:
         return cls(count, mean, scatter, voxels.planes[slots, 3:6], voxels.planes[slots, 7], tree, touching)
 
     def grow(self, seed: int, mean: Floats, n: Floats, radii: tuple[float, ...], free: Bools) -> Longs:
-        """The voxels, sorted, of the plane through `mean` (3,) with normal n (3,) that touch the cell `seed`; of the `free`."""
+        """Sorted indices of the `free` voxels connected to `seed` that lie on the plane through `mean` (3,) with normal n (3,)."""
         d, alone = float(n @ mean), np.array([seed])
         region = alone
         for radius in radii:
@@ -303,7 +305,7 @@ class _Seeds:
 
     @classmethod
     def of(cls, cells: _Cells, planes: Floats, size: int = 1) -> _Seeds:
-        """Those of voxels `planes` (V, 8) that are planes, the surest first; `size` : of a voxel, in cells."""
+        """Seeds at the voxels `planes` (V, 8) that are planar, most certain first; `size` : edge of such a voxel, in cells."""
         planes = planes[planes[:, 7] > 0]
         planes = planes[np.argsort(planes[:, 7], kind="stable")]
         nearest = np.zeros(0, np.int64)

@@ -38,10 +38,10 @@ MOST_STEPS, SMALL = 5, 0.02
 
 @dataclass(frozen=True)
 class Landmarks:
-    """What is known of the planes beside their closest points.
+    """Attributes of the planes besides their closest points.
 
     anchors : (M, 4, 4) T_world_anchor, fixed frames of LiDARs that saw the planes first
-    lows, highs : (M, 3) corners of the boxes round what was seen of them, world, m; unseen : (M,) scans since
+    lows, highs : (M, 3) corners of the boxes round their seen parts, world, m; unseen : (M,) scans since
     """
 
     anchors: Floats = field(default_factory=lambda: np.zeros((0, 4, 4)))
@@ -65,7 +65,7 @@ class Landmarks:
         return replace(self, lows=low, highs=high, unseen=unseen)
 
     def join(self, anchor: Floats, lows: Floats, highs: Floats) -> Landmarks:
-        """These and K new ones, with their boxes (K, 3) and a common anchor (4, 4)."""
+        """These and K new ones, with their boxes (K, 3), world, and a common anchor (4, 4)."""
         return Landmarks(
             np.concatenate([self.anchors, np.broadcast_to(anchor, (len(lows), 4, 4))]),
             np.concatenate([self.lows, lows]),
@@ -102,7 +102,7 @@ class PlaneWindow:
         return np.asarray(se3.normalise(self.values.poses[-1] @ self.T_imu_lidar))
 
     def extend(self, step: PreintegratedStep) -> PlaneWindow:
-        """With one more state, where `step` leads from the newest one."""
+        """The window with one more state, predicted by `step` from the newest one."""
         v = self.values
         doubled = replace(
             v,
@@ -130,7 +130,7 @@ class PlaneWindow:
         return replace(self, sightings=self.sightings.join(more), landmarks=self.landmarks.observe(planes, lows, highs))
 
     def with_planes(self, cp: Floats, information: Floats, lows: Floats, highs: Floats) -> PlaneWindow:
-        """The newest state saw new planes (K): its LiDAR is their anchor."""
+        """The window with K new planes of the newest state, whose LiDAR is their anchor: cp (K, 3), its information, boxes."""
         count, old = len(cp), len(self.landmarks)
         pad = np.zeros((len(self.prior.gradient) + PLANE_SIZE * count,) * 2)
         n = len(self.prior.gradient)
@@ -143,7 +143,7 @@ class PlaneWindow:
         return replace(self, values=values, prior=prior, sightings=self.sightings.join(more), landmarks=landmarks)
 
     def solve(self) -> tuple[PlaneWindow | None, int]:
-        """At the minimum of all factors, and after how many Gauss-Newton steps; None where H is not positive definite."""
+        """The window at the minimum of all factors, and the number of Gauss-Newton steps; None where H is not positive definite."""
         window, count = self, 0
         pose = np.arange(6) + self.values.first_plane - STATE_SIZE
         while count < MOST_STEPS:
@@ -184,6 +184,7 @@ class PlaneWindow:
         return window._without_planes(window.landmarks.unseen >= UNSEEN_SCANS)
 
     def _without_oldest(self) -> PlaneWindow:
+        """The window with its oldest state and its sightings marginalised into the prior."""
         v, of_first = self.values, self.sightings.states == 0
         few = replace(self, values=v.select(slice(2)), steps=self.steps[:1], sightings=self.sightings.only(of_first))
         out = np.zeros(few.values.size, bool)
@@ -200,6 +201,7 @@ class PlaneWindow:
         )
 
     def _without_planes(self, is_old: Bools) -> PlaneWindow:
+        """The window with the planes `is_old` (M,) marginalised, unless a state of it still sees them."""
         is_old = is_old & ~np.isin(np.arange(len(is_old)), self.sightings.planes)
         if not is_old.any():
             return self
@@ -226,7 +228,7 @@ GATE_CHI2 = 16.27
 
 
 def associate(window: PlaneWindow, planes: Planes, covariance: Floats) -> Longs:
-    """(K,) landmark of each plane, -1 where it is none of them.
+    """(K,) landmark of each plane by Mahalanobis distance, -1 where none matches.
 
     window : its newest state predicted; covariance : (27 + 3 M) square of that, from `joint_covariance`
     """
@@ -255,7 +257,7 @@ def associate(window: PlaneWindow, planes: Planes, covariance: Floats) -> Longs:
 
 
 def _candidates(window: PlaneWindow, planes: Planes) -> tuple[Longs, Longs]:
-    """Pairs of planes and landmarks that are alike, near, and overlap as far as was seen."""
+    """Indices of planes and of landmarks, in pairs, with similar normal and offset whose boxes overlap."""
     marks, T = window.landmarks, window.T_world_lidar
     expected = transform_planes(window.values.planes, np.linalg.inv(marks.anchors) @ T)
     n, _ = to_hesse(planes.cp)

@@ -36,7 +36,7 @@ def create(config: Config) -> SmallGicp:
 
 
 class SmallGicp(Traits):
-    """GICP, scan to keyframe map. Not ours: with several threads its sums may differ in the last digits."""
+    """GICP, scan to keyframe map, by the package small_gicp; with several threads its sums may differ in the last digits."""
 
     def __init__(self, preprocess: PreprocessConfig, limits: RegistrationConfig, threads: int = 2) -> None:
         with importing("small_gicp", install_hint("small-gicp")):
@@ -53,7 +53,7 @@ class SmallGicp(Traits):
         return self._with_covariances(points.astype(np.float64))[0] if len(points) >= MIN_SOURCE_POINTS else None
 
     def register(self, scan: Scan, prepared: Any, prior: MotionPrior) -> ScanResult:
-        """Align with the local map; enter a keyframe when the sensor has moved on."""
+        """Align with the local map; the scan becomes a keyframe of it when the sensor has moved far enough."""
         began = time.perf_counter()
         alignment = self._align(prepared, prior.pose)
         aligned = time.perf_counter()
@@ -64,6 +64,7 @@ class SmallGicp(Traits):
         return result
 
     def _align(self, source: Any, T_prior: Floats) -> RegistrationResult:
+        """Align prepared points with the map by small_gicp; the prior itself without a map or with too few points."""
         count = 0 if source is None else source.size()
         if self._target is None or count < MIN_SOURCE_POINTS:
             return RegistrationResult(T_prior, source_points=count, inliers=count)

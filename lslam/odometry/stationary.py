@@ -68,7 +68,7 @@ class StationaryDetector(Stateful):
         )
 
     def observe(self, scan: Scan, result: ScanResult) -> None:
-        """Take a registered scan as the reference if the sensor was slow."""
+        """Make a registered scan the new reference if the sensor was slow; else there is none."""
         self._T_own = None
         if result.status != "ok":
             return
@@ -98,6 +98,7 @@ class StationaryDetector(Stateful):
         return solve((self._planes,), points, np.eye(4), once, c, residual=PLANES_ALONE)
 
     def _is_stationary(self, scan: Scan) -> bool:
+        """Whether the scan lies on the reference within the limits, by one point-to-plane step with small covariance."""
         if self._T_own is None:
             return False
         result = self._step(prepare_points(scan.points, self._preprocess, scan.index))

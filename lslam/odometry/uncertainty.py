@@ -40,9 +40,9 @@ class DeskewUncertainty(Stateful):
         self._span_s = self._lead_s = 0.0
 
     def observe(self, prior: MotionPrior, stamp_ns: int, pose: Floats, has_registration: bool) -> Floats:
-        """(6, 6) covariance, world axes, of the pose (4, 4) found at `stamp_ns` for the scan that `prior` deskewed.
+        """(6, 6) covariance, world axes, of the registered pose (4, 4) at `stamp_ns` due to errors of the deskewing motion.
 
-        Zero for scans of one instant. A pose without a registration is not learnt from, nor is the one after it.
+        Zero for scans of one instant. A pose without a registration is not used for the estimate, nor is the next one.
         """
         step_s = 0.0 if self._stamp_ns is None else 1e-9 * (stamp_ns - self._stamp_ns)
         if has_registration and self._span_s > 0 and step_s > 0:
@@ -70,7 +70,7 @@ class DeskewUncertainty(Stateful):
         return noise.rotate(share * self._mean + (1.0 - share) * np.diag(alike), pose[:3, :3])
 
     def _learn(self, change: Floats, step_s: float) -> None:
-        """From the change (6,) of the motion over `step_s` seconds since the last scan."""
+        """Update the estimate by the change (6,) of the motion over `step_s` seconds since the last scan."""
         share, lead = min(self._span_s / step_s, 1.0), min(self._lead_s / step_s, 1.0)
         # The ratio to the prediction error a dt^2 - a L dt / 2 of the error a (L dt / 4 - L^2 / 12 + (T^2 - L^2) / 24).
         part = lead * (3.0 - lead) / (12.0 - 6.0 * lead) + (share**2 - lead**2) / (24.0 - 12.0 * lead)
@@ -128,9 +128,9 @@ class PoseUncertainty(Stateful):
         return self.add(result, sweep), own
 
     def add(self, result: RegistrationResult, sweep: Floats | None = None) -> Floats | None:
-        """(6, 6) covariance of the pose, t' = t + d[:3], R' = exp(d[3:]) R in world axes, m2 and rad2.
+        """(6, 6) covariance of the pose, t' = t + d[:3], R' = exp(d[3:]) R in world axes, m2 and rad2; None if it has none.
 
-        sweep : (6, 6) of it that comes from the motion within the sweep, none when absent
+        sweep : (6, 6) part due to the motion within the sweep, None for zero
         A failed registration affects the covariance of its own pose only: the next good one is relative to the map again.
         """
         if result.covariance is None:

@@ -93,9 +93,9 @@ class Checkpoints:
         self.schedule = CheckpointSchedule(every_s)
 
     def write(self, scans: int, content: Callable[[], State]) -> None:
-        """Write what is known after `scans` scans, and what the run was warned of until there; raises OutputError.
+        """Write the state that `content` returns after `scans` scans, with the run's warnings; delete all but the newest two.
 
-        To gather it counts as time for the pace.
+        The time this takes is reported to the schedule. Raises OutputError.
         """
         began = time.perf_counter()
         self.folder.mkdir(exist_ok=True)
@@ -107,7 +107,7 @@ class Checkpoints:
         self.schedule.wrote(time.perf_counter() - began)
 
     def latest(self) -> Any:
-        """What the newest checkpoint that can be read holds, its warnings being those of this run now; None without one."""
+        """State of the newest readable checkpoint, whose warnings are added to this run's; None without. Deletes damaged ones."""
         for path in reversed(self._files()):
             try:
                 record = read_state(path, STATE_CLASSES)
@@ -129,9 +129,9 @@ class Checkpoints:
 
 
 class OdometryCheckpoints:
-    """Checkpoints of odometry: results so far, keyframes, and the state of whatever a next scan depends on.
+    """Checkpoints of odometry: results so far, keyframes, and all state that the next scan depends on.
 
-    A method that is not `Resumable` leaves one at the end of odometry only: before, it has to begin again.
+    A method that is not `Resumable` has one after the last scan only: an earlier one could not be continued.
     """
 
     def __init__(self, checkpoints: Checkpoints) -> None:
@@ -167,7 +167,10 @@ class OdometryCheckpoints:
         return self._seconds
 
     def begin(self, tracker: WindowTracker, keyframing: Keyframing) -> list[ScanResult]:
-        """Put the tracker and the keyframes where the newest checkpoint left them; the results until there."""
+        """Restore tracker and keyframes from the newest checkpoint, and return its results; empty without one.
+
+        Raises InputError for a damaged checkpoint.
+        """
         self._began = time.monotonic()
         latest = self._latest
         if latest is not None:
@@ -203,6 +206,7 @@ class OdometryCheckpoints:
             self._write(results, tracker, keyframing, is_over)
 
     def _write(self, results: list[ScanResult], tracker: WindowTracker, keyframing: Keyframing, is_over: bool) -> None:
+        """Write a checkpoint, unless all scans were skipped or a result is still pending; is_over : after the last scan."""
         if all(result.status == "skipped" for result in results):
             return  # bad input: nothing to go on with
         if not is_over and (keyframing.is_waiting or not tracker.is_complete):

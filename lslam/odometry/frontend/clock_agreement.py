@@ -69,7 +69,7 @@ class ClockComparison(NamedTuple):
 
 
 class _KnownSteps(ConstantVelocity):
-    """Predicts each scan by the motion from the scan before that was found without a clock."""
+    """Motion model that predicts each scan by the known motion between scans, estimated before without point times."""
 
     def __init__(self, stamps_ns: list[int], steps: list[Floats]) -> None:
         super().__init__()
@@ -98,10 +98,10 @@ class _ScanAtPose:
 
 
 class ClockWindow:
-    """Consecutive scans, over which clocks are tried; the same clock is tried once.
+    """Consecutive scans on which candidate clocks are scored; scores are cached.
 
-    Where the sensor goes is found once, without a clock. Under each clock, and without one, odometry then predicts each scan by
-    that and searches nothing.
+    The motion is estimated once, without a clock. For each clock, and without one, odometry then predicts each scan by
+    that motion, without a wide search.
     """
 
     def __init__(self, scans: list[Scan], preprocess: PreprocessConfig) -> None:
@@ -126,7 +126,7 @@ class ClockWindow:
         return moved > STILL_M or float(np.median([so3.angle(step[:3, :3]) for step in self._steps])) > STILL_RAD
 
     def scores(self, clock: SweepClock | None) -> Floats:
-        """(S,) how far the points that were kept out lie from the surfaces of the other scans, 0 to 1, of each scan judged."""
+        """(S,) for each scan, the mean bounded distance (0 to 1) of its held-out points from the surfaces of the other scans."""
         if clock not in self._scores:
             config = self._config.model_copy(update={"recovery": _NO_SEARCH})
             motion = _KnownSteps([scan.stamp_ns for scan in self.scans], self._steps)
@@ -141,7 +141,7 @@ class ClockWindow:
         return bool((self.scores(clock) >= _WORST_SCORE).all())
 
     def _place(self, clock: SweepClock | None, config: Config, motion: ConstantVelocity | None) -> list[_ScanAtPose]:
-        """The scans where odometry has them under the clock."""
+        """Register the scans with the times of the clock; each with pose, surface points and held-out points in the world."""
         odometry = create_odometry(config)
         tracker = Tracker(odometry, motion=motion)
         at_poses = []
@@ -156,7 +156,7 @@ class ClockWindow:
         return at_poses
 
     def _is_same_motion(self, at_poses: list[_ScanAtPose]) -> bool:
-        """Whether the scans move as they do without a clock, as far as rotations within their sweeps allow."""
+        """Whether the scans move as they do without a clock, within bounds that grow with distance and rotation."""
         turn = max(float(so3.angle(step[:3, :3])) for step in self._steps)
         for a, b, step in zip(at_poses[:-1], at_poses[1:], self._steps[SKIPPED - 1 :], strict=True):
             expected, moved = step[:3, 3], se3.relative(a.pose, b.pose)[:3, 3]
@@ -174,7 +174,7 @@ class ClockWindow:
 
 
 def read_window(sequence: Sequence, first: int, preprocess: PreprocessConfig) -> ClockWindow | None:
-    """The scans from `first` on; None where too few of them can be read."""
+    """A window of the scans from `first` on; None where fewer than `FEWEST_SCANS` of them can be read."""
     scans = []
     for index in range(first, min(first + SCANS, len(sequence))):
         try:
@@ -186,7 +186,7 @@ def read_window(sequence: Sequence, first: int, preprocess: PreprocessConfig) ->
 
 
 def compare_clocks(windows: list[ClockWindow], better: SweepClock | None, worse: SweepClock | None) -> ClockComparison:
-    """By how much the scans of the windows agree better under one clock than under another."""
+    """Paired comparison of two clocks over all scans: t statistic, share of scans that prefer `better`, relative difference."""
     good, bad = (np.concatenate([window.scores(clock) for window in windows]) for clock in (better, worse))
     difference = bad - good
     spread = float(difference.std(ddof=1)) / np.sqrt(len(difference))
@@ -221,6 +221,7 @@ def _distances(scans: list[_ScanAtPose]) -> Floats:
 
 
 def _distance(tree: Any, cloud: Floats, owner: Longs, number: int, points: Floats) -> float:
+    """Mean bounded squared distance (0 to 1) of points (N, 3) from planes through neighbours in `cloud` of scans but `number`."""
     away, near = tree.query(points, k=_NEIGHBOURS, distance_upper_bound=_RADIUS_M)
     is_there = np.isfinite(away)
     near = np.where(is_there, near, 0)

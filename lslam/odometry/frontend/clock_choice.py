@@ -34,10 +34,10 @@ _FORWARD_T = 5.0
 
 @dataclass(frozen=True)
 class ClockChoice:
-    """The clock of a recording's points, None for no times, and how it was found.
+    """The clock of a recording's points, None for no times, and how it was decided.
 
-    scores : mean distance of the points that were kept out from the surfaces of other scans, 0 to 1, by clock
-    later : scans from which on it no longer fits, and what they chose
+    scores : mean distance of the held-out points from the surfaces of other scans, 0 to 1, by clock
+    later : scans from which on it no longer fits, and their own choices
     """
 
     clock: SweepClock | None
@@ -47,7 +47,7 @@ class ClockChoice:
     later: tuple[tuple[int, ClockChoice], ...] = ()
 
     def facts(self) -> dict[str, Any]:
-        """As plain values, for the manifest."""
+        """Clock, verdict, scores and later choices as plain values, for the manifest."""
         later = [{"scan": first, **choice.facts()} for first, choice in self.later]
         return {
             "clock": None if self.clock is None else self.clock.facts(),
@@ -58,7 +58,7 @@ class ClockChoice:
 
 
 def choose_clock(sequence: Sequence, proposal: Proposal, sample: Scan, preprocess: PreprocessConfig) -> ClockChoice:
-    """Decide for a recording without per-point times, by the first of its scans in which the sensor moves.
+    """Choose the clock of a recording without per-point times, by the first of its scans in which the sensor moves.
 
     sample : any scan of the recording
     """
@@ -82,7 +82,7 @@ def choose_clock(sequence: Sequence, proposal: Proposal, sample: Scan, preproces
 
 
 def _moving(sequence: Sequence, preprocess: PreprocessConfig) -> Iterator[ClockWindow]:
-    """Windows in which the sensor moves, the first ones first."""
+    """Windows in which the sensor moves, at the begin and then at even intervals, in order of time."""
     last = max(len(sequence) - SCANS, 0)
     places = [0, SCANS, *np.linspace(0, last, _PLACES).round().astype(int).tolist()]
     end = 0
@@ -96,9 +96,9 @@ def _moving(sequence: Sequence, preprocess: PreprocessConfig) -> Iterator[ClockW
 
 
 def _judge(windows: list[ClockWindow], proposal: Proposal, sample: Scan) -> ClockChoice:
-    """The clock under which the scans of the windows agree best, where that is clear.
+    """Choose the clock under which the scans of the windows agree best, if it is clear.
 
-    No times, the proposal and its reverse come first among those that are tried.
+    Candidates are no times, the proposal and its reverse first, then others.
     """
     forward = proposal.clock
     backward = replace(forward, is_reversed=True)
@@ -128,6 +128,7 @@ def _verdict(
     sample: Scan,
     is_guess: bool,
 ) -> ClockChoice:
+    """The choice for the clock of best score: clear, unclear, or motion compensated; is_guess : the proposal is a mere guess."""
     scores = {_name(clock): mean_score(windows, clock) for clock in candidates}
     rivals = [clock for clock in candidates if clock is not best and not _is_alike(best, clock, sample)]
     results = {_name(clock): compare_clocks(windows, best, clock) for clock in rivals}
@@ -176,7 +177,7 @@ def _is_forward(windows: list[ClockWindow], best: SweepClock, reverse: SweepCloc
 
 
 def _is_alike(best: SweepClock | None, other: SweepClock | None, sample: Scan) -> bool:
-    """Whether the two need not, or cannot, be told apart."""
+    """Whether two clocks are nearly equal, or deskew the points of `sample` alike, so that they cannot be distinguished."""
     if best is None or other is None:
         return best is other
     apart = abs((best.turn - other.turn + 0.5) % 1.0 - 0.5)

@@ -107,7 +107,7 @@ def save_start(path: Path, part: Inertial) -> None:
 
 
 def load_start(path: Path, config: Config) -> Inertial | None:
-    """What `begin_inertial` found in an earlier run; None when that is not there, or cannot be read."""
+    """The result of `begin_inertial` that an earlier run wrote to `path`; None when it is absent or unreadable."""
     try:
         record = read_state(path, STATE_CLASSES) if path.is_file() else None
     except InputError as error:
@@ -122,7 +122,7 @@ def load_start(path: Path, config: Config) -> Inertial | None:
 
 
 def _begin(sequence: Sequence, imu: ImuStream, T_lidar_imu: Floats, config: Config) -> InertialStart:
-    """The start by scans registered without the IMU; again by scans that it then deskewed, where that matters."""
+    """Initialise the IMU by scans registered without it; again by scans deskewed with it, where that matters."""
     last_ns = int(sequence.stamps_ns[-1])
     first = first_poses(sequence, config, None)
     opening = start(imu, T_lidar_imu, first, last_ns, config.imu)
@@ -150,9 +150,9 @@ def with_imu_settings(config: Config) -> Config:
 
 
 def first_poses(sequence: Sequence, config: Config, motion: InertialMotion | None) -> FirstPoses:
-    """The first seconds, every scan of them, by `icp` in its defaults, up to the first that fails.
+    """Register every scan of the first seconds by `icp` with its defaults, up to the first that fails.
 
-    Where the IMU begins later, its first seconds, and all scans before.
+    Where the IMU begins later, up to its first seconds. motion : deskews the scans; None: constant velocity
     """
     whole, first = (sequence.whole, int(sequence.indices[0])) if isinstance(sequence, Selection) else (sequence, 0)
     begin_ns = first_imu_ns(sequence.imu, whole.stamps_ns[first:], config)
@@ -195,7 +195,7 @@ def first_poses(sequence: Sequence, config: Config, motion: InertialMotion | Non
 
 
 def first_imu_ns(imu: ImuStream | None, stamps_ns: Longs, config: Config) -> int:
-    """Since when the IMU tells of the scans: from the first on, unless it begins among the later ones."""
+    """Stamp, ns, from which on the IMU covers the scans: the first scan's, unless the IMU begins later than a gap."""
     first_ns = int(stamps_ns[0])
     if imu is None:
         return first_ns
@@ -206,7 +206,7 @@ def first_imu_ns(imu: ImuStream | None, stamps_ns: Longs, config: Config) -> int
 
 
 def close_inertial(part: Inertial, results: list[ScanResult]) -> dict[str, Any]:
-    """What the manifest says of the IMU when the run is over; problems that arose on the way are added to `part`."""
+    """Facts about the IMU for the manifest, after the run; problems of the run are appended to those of `part`."""
     motion, opening = part.motion, part.start
     if motion is None or opening is None:
         return {"used": False, "decisions": [*part.notes, *part.problems]}
@@ -243,7 +243,7 @@ def close_inertial(part: Inertial, results: list[ScanResult]) -> dict[str, Any]:
 
 
 def _savings(results: list[ScanResult]) -> dict[str, Any]:
-    """What the IMU saved on the scans that were registered from constant velocity too; means over them."""
+    """Mean iterations and time that the IMU saved, over the scans that were also registered from constant velocity."""
     sample = [
         (r.iterations, r.imu.steady_iterations, r.imu.saved_s)
         for r in results
@@ -270,10 +270,10 @@ LEAST_TURN_RAD, SIGMAS = np.deg2rad(2.0), 4.0
 
 
 def mounting_problem(motion: InertialMotion) -> str:
-    """A sentence where the turns contradict the rotation of T_lidar_imu and it is not estimated; else empty.
+    """A sentence where the rotations contradict that of T_lidar_imu and it is not estimated; else empty.
 
-    Turns about one axis do not tell a turned device from one whose axes are askew; those about a second one do. The advice is
-    one that the method of this motion model takes.
+    Rotations about one axis do not distinguish a wrongly mounted device from one with misaligned axes; a second axis does.
+    The advice fits the method of this motion model.
     """
     gyroscope = motion.estimate.gyroscope
     angle, sigma = gyroscope.tilt
@@ -302,10 +302,9 @@ def _has_turn(gyroscope: Gyroscope) -> bool:
 
 
 def calibration_of(gyroscope: Gyroscope, opening: InertialStart) -> dict[str, Any]:
-    """For the manifest: what was estimated, with its sigma; empty where nothing was to be.
+    """Estimated time offset and mounting with their sigmas, for the manifest; empty where neither was estimated.
 
-    `mounting_deg` turns readings into the axes of the T_lidar_imu that was given, a rotation vector; `T_lidar_imu` is that with
-    it.
+    `mounting_deg` is the rotation vector from IMU readings to the axes of the configured T_lidar_imu; `T_lidar_imu` includes it.
     """
     facts: dict[str, Any] = {}
     if gyroscope.has_offset:

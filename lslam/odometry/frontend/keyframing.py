@@ -29,8 +29,8 @@ class _Due:
 class Keyframing(Stateful):
     """Feeds the store with the scans that become keyframes, whatever the method.
 
-    A scan registered before the speed was known takes the motion within its sweep from the first scan that knows it.
-    `threads` below 2 does everything at once. To be closed, which waits for what is on its way: a `with` block does.
+    A scan registered before the speed was known takes the motion within its sweep from the first scan after.
+    `threads` below 2 does everything at once. Use it in a `with` block, whose end waits for pending work.
     """
 
     STATE = ("store", "_selector")
@@ -44,7 +44,7 @@ class Keyframing(Stateful):
         self._unknown: list[_Due] = []
 
     def see(self, position: int, scan: Scan | None, result: ScanResult, motion: MotionPrior) -> None:
-        """The next scan of the run (None when it could not be read) and how the sensor moved within its sweep.
+        """Process the next scan of the run (None when unreadable); motion : of the sensor within its sweep.
 
         Raises OutputError when the store cannot be written, by this scan or one before.
         """
@@ -80,7 +80,7 @@ class Keyframing(Stateful):
         return self
 
     def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
-        """Wait for what is on its way; an error of the block is not hidden by one of the disk."""
+        """Wait for pending work; an exception of the block takes precedence over one of writing."""
         try:
             with suppress(*([Exception] if error is not None else [])):
                 self._wait(0)

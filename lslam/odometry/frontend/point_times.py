@@ -38,12 +38,12 @@ _SAMPLES = 5
 
 
 def with_point_times(sequence: Sequence, preprocess: PreprocessConfig, is_stated_only: bool = False) -> Sequence:
-    """The sequence with the times of its points where no field has them; what was decided is among its notes.
+    """The sequence with point times where no field has them; the decision is among its notes.
 
-    is_stated_only : no scan is registered, so nothing is found out
+    is_stated_only : no scan is registered, so no clock is estimated
 
-    A sequence with times, one that is motion compensated and one whose points no clock fits come back as they are. The
-    recording decides, whatever part of it is used. Raises InputError when what is stated does not fit the scans.
+    A sequence with times, one that is motion compensated and one whose points fit no clock are returned unchanged. The
+    whole recording decides, whatever part of it is used. Raises InputError when the stated times do not fit the scans.
     """
     stated = getattr(sequence, "stated_times", StatedTimes())
     if getattr(sequence, "further_lidars", ()):
@@ -79,7 +79,7 @@ def with_point_times(sequence: Sequence, preprocess: PreprocessConfig, is_stated
 def _by_agreement(
     sequence: Sequence, scans: list[Scan], nominal: SweepClock, preprocess: PreprocessConfig
 ) -> ClockChoice | None:
-    """What the order of points proposes and the agreement of scans decides, again where it no longer fits.
+    """The clock that the order of points proposes and the agreement of scans confirms, also for later parts.
 
     None where nothing is proposed.
     """
@@ -107,7 +107,7 @@ def _decide(sequence: Sequence, proposal: Proposal, sample: Scan, preprocess: Pr
 
 
 def _with(sequence: Sequence, choice: ClockChoice) -> Sequence:
-    """The sequence with the clock of the choice, which the manifest finds as `clock_choice`."""
+    """The sequence with the times of the chosen clock; the choice is its `clock_choice`, for the manifest."""
     again = [f"from scan {first} on the clock no longer fits: {later.sentence}" for first, later in choice.later]
     notes = [*sequence.notes, choice.sentence, *again]
     if choice.verdict == "compensated" and sequence.motion_compensated is None:
@@ -121,7 +121,7 @@ def _with(sequence: Sequence, choice: ClockChoice) -> Sequence:
 def _stated_clock(
     sequence: Sequence, scans: list[Scan], kind: str, nominal: SweepClock, preprocess: PreprocessConfig
 ) -> ClockChoice:
-    """The clock that is stated. Raises InputError where the scans do not have it."""
+    """The clock of the `kind` that `input.point_times` states. Raises InputError where the scans lack the fields it needs."""
     clock: SweepClock | None
     if kind == "columns":
         clock = columns_clock(scans, nominal, getattr(sequence, "rows", None))
@@ -147,7 +147,7 @@ def _stated_clock(
 
 
 def _samples(sequence: Sequence) -> list[Scan]:
-    """Some scans with points, from the first on; the first alone where it has times."""
+    """A few readable scans with points, from the first on; only the first if it has times."""
     scans: list[Scan] = []
     last = len(sequence) - 1
     for index in sorted({*range(min(10, last + 1)), *np.linspace(0, last, _SAMPLES).astype(int).tolist()}):
@@ -173,9 +173,9 @@ _NEARLY = 4
 def later_choices(
     sequence: Sequence, clock: SweepClock, decide: Callable[[int], ClockChoice], preprocess: PreprocessConfig
 ) -> list[tuple[int, ClockChoice]]:
-    """The scans from which on another clock than the one before was chosen, and the choices.
+    """Scans from which on another clock than before was chosen, each with its choice.
 
-    clock : what the first scans chose; decide : the choice of the scans from this one on
+    clock : of the first scans; decide : returns the choice for the scans from a number on
     """
     later: list[tuple[int, ClockChoice]] = []
     rivals = _candidates(clock)

@@ -58,15 +58,13 @@ def estimate(
     noise_m: float = RegistrationConfig().sigma,
     beyond_m: float = surroundings_m(RegistrationConfig()),
 ) -> list[ScanResult]:
-    """Register every scan of the sequence; stops early on `should_stop` only.
+    """Register every scan of the sequence; stops early only when `should_stop` returns True.
 
     A scan that cannot be read, or is empty, is skipped: its pose is the motion prior. `begin` and `initial_scans` make a new
     segment where the map is lost, as in `SegmentTracker`. With `stationary`, scans of a stationary sensor are not registered.
-    `motion` predicts the scans, constant velocity when None.
-    `keyframing` sees every scan and how the sensor moved within it. `checkpoints`, which need keyframing, say where an
-    earlier run left off and keep what this one does. `monitor` checks the pose of every scan. `noise_m` is that of a point, below
-    which a bend within sweeps is none, and scans beyond `beyond_m` see the surroundings of the first from elsewhere, as in
-    `WindowTracker`.
+    `motion` predicts the scans, constant velocity when None. `keyframing` gets every scan and the motion within it.
+    `checkpoints`, which need keyframing, restore an earlier run's state and save this one's. `monitor` checks the pose of every
+    scan. `noise_m`, the noise of a point, and `beyond_m` are those of `WindowTracker`.
     """
     tracker = SegmentTracker(Tracker(odometry, stationary, motion), begin, initial_scans)
     windows = WindowTracker(tracker, monitor, noise_m, beyond_m)
@@ -96,7 +94,7 @@ def estimate(
 def _observe(
     track: TrackedScan, position: int, keyframing: Keyframing | None, monitor: IntegrityMonitor | None
 ) -> ScanResult:
-    """The result of the scan at this position of the run with its times, after keyframing and monitor saw it."""
+    """The scan's result with its times, after keyframing and monitor processed it."""
     entry, result = track.entry, track.result
     stages = {"read": entry.read_s, "prepare": entry.prepare_s, **result.stages}
     if keyframing is not None:
@@ -136,12 +134,12 @@ def diverges(results: list[ScanResult]) -> bool:
 
 
 def between_middles(result: ScanResult, middle: tuple[int, Floats], following: TrackedScan) -> ScanResult:
-    """The result with its pose at the stamp between the middles of its sweep and the next one, where it lies there.
+    """The result with its stamp's pose interpolated between the middles of this sweep and the next, if it lies between them.
 
     middle : instant, ns, and pose of the middle of its own sweep
 
-    From its own middle a stamp at the end of a sweep is extrapolated, where one at the start lies between two: the error of the
-    speed within a sweep that changes its direction is as large as a step.
+    From its own middle, a stamp at the end of a sweep would be extrapolated: where the sweep changes its direction, the error
+    of the speed is as large as a step.
     """
     (begin_ns, begin), (end_ns, end), after = middle, following.middle, following.result
     is_placed = all(r.status == "ok" and not r.repeats_pose and r.segment == after.segment for r in (result, after))
@@ -196,6 +194,7 @@ def read_ahead(
 
 
 def _load(sequence: Sequence, i: int, prepare: Callable[[Scan], Any] | None) -> ScanInput:
+    """Read scan `i` and prepare it, with times taken; unreadable, empty and unusable scans have an `error` instead."""
     stamp_ns = int(sequence.stamps_ns[i])
     began = time.perf_counter()
     try:

@@ -42,7 +42,7 @@ def with_scene_scale(config: Config, sequence: Sequence) -> Config:
 
 
 def in_scale(config: Config, sequence: Sequence) -> Config:
-    """The configuration with the lengths that nobody has set times the scale of the scene."""
+    """The configuration with the lengths that the user has not set multiplied by the scale of the scene."""
     free = {
         name: [key for key in keys if key not in getattr(config, name).model_fields_set]
         for name, keys in LENGTHS.items()
@@ -59,7 +59,7 @@ def in_scale(config: Config, sequence: Sequence) -> Config:
 
 
 def scene_scale(sequence: Sequence) -> float:
-    """The configured lengths in the scene, as a part of those in streets, at most 1.
+    """Scale of the scene relative to streets, at most 1, by the median range and the gap between rings.
 
     The largest of the first, middle and last scan, so that a covered sensor decides nothing; 1 where none can be read.
     """
@@ -88,7 +88,7 @@ LEVELLING_S = 10.0
 
 
 def with_up(sequence: Sequence, config: Config) -> Config:
-    """The configuration with `preprocess.up` where the sensor hangs, lies or is pitched by more than 45 deg; else as it is."""
+    """The configuration with `preprocess.up` set where the sensor is tilted by more than 45 deg; else unchanged."""
     if config.preprocess.up is not None:
         return config
     up = _up_of(sequence, config)
@@ -102,9 +102,9 @@ def with_up(sequence: Sequence, config: Config) -> Config:
 
 
 def _up_of(sequence: Sequence, config: Config) -> Up | None:
-    """Up by the first scan, and by the IMU if the run uses it; None without a scan.
+    """Up direction by the first scan, and by the IMU if the run uses it; None without a scan.
 
-    What the first scan does not confirm, that z is up, is asked of the largest of a few.
+    Where the first scan does not confirm that z is up, the largest of a few scans decides.
     """
     plain = config.preprocess.model_copy(update={"remove_ground": False, "denoise": False})
     scans = (scan for _, scan in readable(range(len(sequence)), sequence.scan))

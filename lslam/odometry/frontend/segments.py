@@ -83,9 +83,9 @@ class SegmentTracker(Stateful):
         return isinstance(self.present.motion, ConstantVelocity) and self.present.is_deskewing
 
     def decide(self, entry: ScanInput | None, result: ScanResult | None) -> list[TrackedScan]:
-        """The scans that are decided with the next one, in order: none while two hypotheses are open, all at the end, None.
+        """The scans whose segment is decided with the next one, in order; none while both hypotheses are open.
 
-        result : of the present tracker
+        entry : None after the last scan, which decides all; result : of the present tracker for the scan
         """
         if entry is None or result is None:
             return self._finish()
@@ -125,6 +125,7 @@ class SegmentTracker(Stateful):
         self._other, self._open = None, []
 
     def _new_segment(self) -> list[TrackedScan]:
+        """Continue with the tracker of the new map; returns the scans since, as it registered them."""
         assert self._other is not None
         registered = [other for _, other in self._open]
         # The motion model is known to others by its first object.

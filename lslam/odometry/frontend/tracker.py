@@ -76,7 +76,7 @@ class Tracker(Stateful):
         self._first: tuple[Scan, Any, Floats] | None = None
 
     def track(self, entry: ScanInput) -> ScanResult:
-        """Pose of the next scan."""
+        """Estimate the pose of the next scan and update odometry and motion model by it."""
         scan, motion, clock = entry.scan, self.motion, StageClock()
         self._clock = clock
         standing = self._standing(scan)
@@ -145,7 +145,7 @@ class Tracker(Stateful):
         super().restore(state)
 
     def _standing(self, scan: Scan | None) -> ScanResult | None:
-        """The result of a scan taken while the sensor stood; None where it has moved."""
+        """The result of a scan taken while the sensor was stationary; None where it has moved."""
         if scan is None or self.stationary is None:
             return None
         with self._clock.stage("standing"):
@@ -170,9 +170,9 @@ class Tracker(Stateful):
         prior: MotionPrior,
         expected: MotionPrior,
     ) -> tuple[RegistrationResult, MotionPrior]:
-        """The registration fused with the IMU, or one near the prediction `expected`, and the motion within the sweep.
+        """The registration fused with the IMU, or one repeated from the prediction `expected`, and the motion within the sweep.
 
-        A registration is rejected where no vehicle gets to its pose from the last one.
+        A registration is rejected where no vehicle could reach its pose from the last one.
         """
         with self._clock.stage("imu"):
             fused = _fuse_with(self.motion, odometry, stamp_ns, alignment, prior)
@@ -201,9 +201,9 @@ class Tracker(Stateful):
     def _record(
         self, result: ScanResult, expected: MotionPrior, steady: Floats | None, trial: RegistrationResult | None
     ) -> ScanResult:
-        """The result beside its predictions, and beside what registration from constant velocity took.
+        """The result with the error of its predictions, and with the cost of registration from constant velocity (`trial`).
 
-        The map's update is no part of either.
+        steady : (4, 4) prediction of constant velocity. The time of the map's update counts for neither.
         """
         pose, is_ok = result.T_world_lidar, result.status == "ok"
         own = {
@@ -226,7 +226,7 @@ class Tracker(Stateful):
     def _refine(
         self, register: Register, scan: Scan, prior: MotionPrior, motion: MotionModel, clock: StageClock
     ) -> tuple[RegistrationResult, MotionPrior]:
-        """Register, and again with the motion within the sweep that follows from the pose; also that of the final deskewing.
+        """Register, and once more if the motion within the sweep that follows from the pose differs; with the motion used last.
 
         motion : refines the prior by the registered pose; clock : measures its time
         """
@@ -250,9 +250,9 @@ class Tracker(Stateful):
         second: Scan,
         alignment: RegistrationResult,
     ) -> MotionPrior:
-        """The first scan was taken at an unknown speed: now that it is known, deskew it and build the map anew.
+        """Deskew the first scan, taken at an unknown speed, by the speed that the second revealed, and build the map anew.
 
-        The prior of the second scan, whose registration told the speed.
+        Returns the prior of the second scan, to be registered again.
         """
         self.motion.correct(second.stamp_ns, alignment.T_world_lidar)
         again = self.motion.sweep(second.stamp_ns, second.span)
@@ -265,7 +265,7 @@ class Tracker(Stateful):
 def _fuse_with(
     motion: MotionModel, odometry: Deskewing, stamp_ns: int, result: RegistrationResult, prior: MotionPrior
 ) -> RegistrationResult:
-    """The registration fused with the motion model; of a window, once more where that moves its scans."""
+    """The registration fused by the motion model. A window is fused with the scan's normal equations, and once more if it moved."""
     if not (isinstance(motion, WindowMotion) and isinstance(odometry, WindowMethod)):
         return motion.fuse(stamp_ns, result, prior)
     motion.take(odometry.equations(stamp_ns, result))
@@ -280,10 +280,10 @@ def _fuse_with(
 def _nearest(
     near: RegistrationResult, alignment: RegistrationResult, denial: RegistrationResult, expected: MotionPrior
 ) -> RegistrationResult:
-    """The scan where it enters after a registration that failed or that the IMU rejected, and one `near` its prediction.
+    """The result to enter after a registration that failed or that the IMU rejected, and one close to its prediction (`near`).
 
-    With perceptual aliasing a wide search converges at the wrong place. The same minimum from both initial guesses is
-    accepted against the IMU.
+    With perceptual aliasing a wide search converges at the wrong place. If both initial guesses lead to the same minimum, it
+    is accepted against the IMU.
     """
     away, off = (apart(pose, alignment.T_world_lidar) for pose in (near.T_world_lidar, expected.pose))
     source = alignment if near.ok and away < SAME_MINIMUM_RATIO * off else denial

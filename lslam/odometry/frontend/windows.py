@@ -30,15 +30,14 @@ from lslam.registration.rest import INLIER_CHI2
 def first_pose(
     tracks: list[TrackedScan], initial_scans: int, create: Callable[[], Deskewing]
 ) -> tuple[Floats, Floats | None]:
-    """(4, 4) pose of the first scan on the map of the later ones, the initial ones left out, and its covariance (6, 6) there.
+    """Pose (4, 4) of the first scan registered on the map of the later ones, without the initial ones, and its covariance.
 
-    The second scan is registered on a map of the first alone. One scan shows surfaces along its rings only: their tilt is known
-    badly, and its error stays between the first pose and all others. A map of many scans has none of it.
+    The second scan is registered on a map of the first alone. One scan shows surfaces along its rings only: their tilt is
+    uncertain, and its error stays between the first pose and all others. A map of many scans is free of it.
 
     create : makes the method with an empty map
-    The pose stays, and there is no covariance, where fewer than `initial_scans` later ones make a map, that does not hold the
-    first in all directions, or an initial one was not registered, or taken at rest. So it is where a smoother links each scan
-    to the one before.
+    Without covariance the pose is the original one: fewer than `initial_scans` later scans make a map, the map does not
+    constrain all directions, an initial scan was not registered or was taken at rest, or a smoother links the scans.
     """
     stays = tracks[0].result.T_world_lidar
     later = [k for k in range(initial_scans, len(tracks)) if _has_place(tracks[k])]
@@ -60,9 +59,9 @@ def first_pose(
 
 
 def _priors(tracks: list[TrackedScan]) -> list[MotionPrior]:
-    """The motion within each sweep about its pose, without what an IMU says of that: it has had its say.
+    """The motion within each sweep about its registered pose, without the IMU's covariance, which has been used already.
 
-    A scan that was taken before the speed was known moved as the first one that knows it.
+    A scan taken before the speed was known gets the motion of the first scan that has one.
     """
     sweeps = [track.sweep for track in tracks]
     usual = next((sweep for sweep in sweeps if len(sweep.times) > 1), sweeps[0])
@@ -194,7 +193,7 @@ class WindowTracker(Stateful):
         return is_looking_back or (self.is_windowed and scan.span.seconds > 0)
 
     def _is_full(self) -> bool:
-        """Whether the window ends with its newest scan: where it has all of its scans, or the sensor leaves its first spot."""
+        """Whether the window ends with its newest scan: it has all of its scans, or the sensor has left its first position."""
         count, rest = len(self._scans), self._resting()
         if rest is None:
             return count >= WINDOW_SCANS
@@ -204,9 +203,9 @@ class WindowTracker(Stateful):
         return end or count >= WINDOW_SCANS
 
     def _resting(self) -> StartAtRest | None:
-        """The first scan of a run that began at rest and was not registered again yet, and its spot; None of other runs.
+        """First scan and position of a run that began at rest, until that scan is registered again; None for other runs.
 
-        The scans after it tell the spot: it alone is known badly.
+        The position is that of the last initial scan, since the first is uncertain.
         """
         if self._world is not None or self._rest is not None:
             return self._rest
@@ -229,7 +228,7 @@ class WindowTracker(Stateful):
         return [t for t, is_far in zip(tracks, far, strict=True) if is_far and _has_place(t)]
 
     def _close(self) -> list[TrackedScan]:
-        """The scans of the window, the first of a run where the later ones put it."""
+        """The scans of the window, tracked again along its course if that is better; a run's first at its corrected pose."""
         is_bent = self.is_windowed and self._follow_course()
         out = [replace(track, has_both_sides=is_bent) for track in self._decided]
         self._before = self._middles()[-NEIGHBOUR_SWEEPS:]
@@ -240,7 +239,7 @@ class WindowTracker(Stateful):
         return [*here, *self._to_world(out)]
 
     def _follow_course(self) -> bool:
-        """Track the window along its course where it bends and more points agree along it in most scans; whether it does."""
+        """Track the window along its course if it bends, and keep that if more points agree in most scans; whether it does."""
         is_bent, is_better, passes = self._is_bent(), True, 0
         # The first course is told by scans that constant velocity deskewed.
         while is_bent and is_better:
@@ -255,9 +254,9 @@ class WindowTracker(Stateful):
         return is_bent
 
     def _look_back(self, tracks: list[TrackedScan]) -> tuple[list[TrackedScan], list[TrackedScan]]:
-        """The window's scans at the spot of a start at rest, and all others, in the tracker's world.
+        """Register the first scan on the later ones; the window's scans at rest, and all others, in the tracker's world.
 
-        That turns with the first scan, which is put on the map of later ones.
+        The world is then defined by the corrected first pose. Without enough later scans, ([], tracks).
         """
         begin, began = self._tracker.begin, time.perf_counter()
         assert begin is not None
@@ -306,6 +305,7 @@ class WindowTracker(Stateful):
         return Course(np.array(instants, np.int64), np.stack(poses))
 
     def _track_again(self, course: Course | None) -> None:
+        """Track the window once more from its begin, by the `course` or by constant velocity (None); costs add up."""
         earlier = [track.result for track in self._decided]
         self._tracker.restore(deepcopy(self._begin))
         self._set_course(course)
@@ -336,7 +336,7 @@ class WindowTracker(Stateful):
 
 
 def _displacement2(track: TrackedScan, course: Course) -> float | None:
-    """Mean square, m2, of the displacement of a scan's points between its sweep and the course; None where either is unknown."""
+    """Mean square, m2, of the displacement of a scan's points between its sweep and the course; None where either is missing."""
     poses = course.at(track.result.stamp_ns, track.sweep.times)
     if poses is None:
         return None

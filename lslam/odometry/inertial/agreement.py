@@ -53,11 +53,11 @@ def check_agreement(
     offset_s: float | None,
     least_offset_s: float = LEAST_OFFSET_S,
 ) -> Agreement:
-    """Compare turns between the poses (N, 4, 4) of the LiDAR with those the gyroscope felt; biases are of no account.
+    """Compare rotations between the poses (N, 4, 4) of the LiDAR with those of the gyroscope; constant biases cancel.
 
-    offset_s : s to add to the IMU's stamps; None looks for it, and takes none below `least_offset_s`
+    offset_s : s to add to the IMU's stamps; None estimates it, and returns 0 for an estimate below `least_offset_s`
 
-    Raises ImuRefusedError saying what is likely wrong: unit, axes, extrinsics, or stamps.
+    Raises ImuRefusedError naming the likely fault: unit, axes, extrinsics, or stamps.
     """
     if len(stamps_ns) < 5:
         return Agreement(False)
@@ -108,7 +108,7 @@ def _scan_rates(stamps_ns: Longs, poses: Floats, width: int = 1) -> Floats:
 
 
 class _GyroRates:
-    """Mean angular rates from scan to scan, or to the one `width` later, in LiDAR axes, for any offset of the clocks."""
+    """Mean angular rates between scans, `width` scans apart, in LiDAR axes, for any offset of the clocks."""
 
     def __init__(self, imu: ImuStream, T_lidar_imu: Floats, stamps_ns: Longs, width: int = 1) -> None:
         self.width = width
@@ -128,12 +128,12 @@ class _GyroRates:
 
 
 def _width(imu_rates: _GyroRates, scan_rates: Floats, stamps_ns: Longs, poses: Floats, offsets: Floats) -> int | None:
-    """Over how many scans turns must be compared for registration's noise to be a small part of them; None over any.
+    """Number of scans to compare rotations over, so that registration's noise is a small part of them; None if none suffices.
 
     imu_rates, scan_rates : from scan to scan; offsets : of the clocks that are possible, s
 
-    What one pose is wrong by, two turns show with opposite signs: the noise stands in how what the gyroscope leaves changes
-    its sign from scan to scan. A wrong gyroscope leaves turns, which do not.
+    An error of one pose enters two successive rotations with opposite signs, so the noise is estimated from the correlation
+    of successive residuals. A faulty gyroscope does not give such alternating residuals.
     """
     best = max(offsets, key=lambda t: _compare(scan_rates, imu_rates.rates(t))[0])
     a, b = _centre(scan_rates, imu_rates.rates(float(best)))
@@ -173,7 +173,7 @@ def _mean_excess(imu_rates: Floats, scan_rates: Floats, T_lidar_imu: Floats) -> 
 
 
 def _hardly_turning(imu_rates: Floats, scan_rates: Floats, T_lidar_imu: Floats) -> Agreement:
-    """Nothing turned, or not beyond noise, so nothing can be compared, unless the gyroscope says something else."""
+    """The agreement (without verdict) for scans that hardly rotate; raises ImuRefusedError where the gyroscope rotates a lot."""
     varied = float(np.nanstd(imu_rates, axis=0).max()) if np.isfinite(imu_rates).any() else 0.0
     shown = float(np.std(scan_rates, axis=0).max())
     if varied > max(20 * LEAST_TURNING, MOST_SCALE * shown):
@@ -185,6 +185,7 @@ def _hardly_turning(imu_rates: Floats, scan_rates: Floats, T_lidar_imu: Floats) 
 
 
 def _refuse_scale(ratio: float) -> None:
+    """Raise ImuRefusedError for a `ratio` of gyroscope to scan rates far from 1; near 57 the unit is deg/s."""
     if LIKELY_DEGREES[0] < ratio < LIKELY_DEGREES[1]:
         raise ImuRefusedError(
             f"its rates are {ratio:.0f} times those of the scans",
@@ -199,9 +200,9 @@ def _refuse_scale(ratio: float) -> None:
 
 
 def _refuse_axes(imu_rates: _GyroRates, scan_rates: Floats, offsets: Floats) -> None:
-    """Refuse turns that are those of the scans about other axes: where one axis turns most, they correlate all the same.
+    """Raise ImuRefusedError where the rotations fit far better about other axes, rotated or mirrored.
 
-    About any axes the best of the `offsets` counts: what a clock mends says nothing about axes.
+    Even wrong axes correlate where one axis rotates most. For each choice of axes the best of the `offsets` (s) counts.
     """
 
     def residual(axes: Floats, t: float) -> float:
@@ -233,7 +234,7 @@ def _best_axes(scan_rates: Floats, imu_rates: Floats) -> tuple[Floats, Floats]:
 
 
 def _no_fit(imu_rates: _GyroRates, scan_rates: Floats, correlation: float) -> ImuRefusedError:
-    """The refusal of turns that do not agree, and what would make them."""
+    """The ImuRefusedError for rotations that do not correlate, with the likely remedy: stamps, T_lidar_imu or axes."""
     what = f"its turns do not fit those of the scans (correlation {correlation:.2f}, {LEAST_CORRELATION} needed)"
     far, score = _best_far(imu_rates, scan_rates)
     if score > 0.9:
@@ -250,7 +251,7 @@ def _no_fit(imu_rates: _GyroRates, scan_rates: Floats, correlation: float) -> Im
 def _beyond(
     imu_rates: _GyroRates, scan_rates: Floats, edge_s: float, at_zero: float, at_edge: float
 ) -> ImuRefusedError:
-    """The refusal of turns that fit the better the farther the stamps are moved."""
+    """The ImuRefusedError for rotations whose correlation grows up to the largest tested offset of the stamps."""
     what = (
         f"its turns fit those of the scans the better the farther its stamps are moved (correlation {at_zero:.2f}, moved by "
         f"{edge_s:+.2f} s {at_edge:.2f})"

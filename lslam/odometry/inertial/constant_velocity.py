@@ -28,7 +28,7 @@ MOTION_SIGMA_M, MOTION_SIGMA_RAD = 0.003, 0.001
 class Course:
     """Natural cubic splines through the poses within and around each sweep.
 
-    instants_ns : (N,); poses : (N, 4, 4). A pose no later than one before it, as of a sliver of a sweep, is left out.
+    instants_ns : (N,); poses : (N, 4, 4). A pose no later than its predecessor, as of a very short sweep, is dropped.
     """
 
     def __init__(self, instants_ns: Longs, poses: Floats) -> None:
@@ -36,7 +36,7 @@ class Course:
         self.instants_ns, self.poses = instants_ns[is_later], poses[is_later]
 
     def at(self, stamp_ns: int, times: Floats) -> Floats | None:
-        """(K, 4, 4) poses at `times` (K,) of a sweep, s from the stamp; None where no pose lies within, or there are few."""
+        """(K, 4, 4) poses at `times` (K,) of a sweep, s from the stamp; None where the course has none in it, or too few."""
         begin, end = stamp_ns + 1e9 * times[0], stamp_ns + 1e9 * times[-1]
         first, last = np.searchsorted(self.instants_ns, begin), np.searchsorted(self.instants_ns, end, side="right")
         if len(times) < 2 or len(self.instants_ns) < NEIGHBOUR_SWEEPS or first == last:
@@ -161,7 +161,7 @@ class ConstantVelocity(Stateful, MotionModel):
         self.course: Course | None = None
 
     def predict(self, stamp_ns: int) -> Floats:
-        """(4, 4) T_world_lidar expected at `stamp_ns`; that of the first scan before it."""
+        """(4, 4) T_world_lidar expected at `stamp_ns`; before the first scan, the initial pose."""
         if self._instant_ns is None or self._step_s <= 0:
             return self._pose.copy()
         if self._predicted is None or self._predicted[0] != stamp_ns:
@@ -175,7 +175,7 @@ class ConstantVelocity(Stateful, MotionModel):
         return self._step_s > 0 or self.course is not None
 
     def sweep(self, stamp_ns: int, span: Span) -> MotionPrior:
-        """Poses over the `span` of the sweep; the one at the stamp when it takes no time."""
+        """Predicted poses over the `span` (s) of the sweep at `stamp_ns`, by the course if it covers it, or constant velocity."""
         knots = knots_over(span)
         poses = None if self.course is None else self.course.at(stamp_ns, knots)
         if poses is None:
@@ -192,9 +192,9 @@ class ConstantVelocity(Stateful, MotionModel):
         return _steady(pose, self._twist / self._step_s, knots_over(span))
 
     def refine(self, prior: MotionPrior, stamp_ns: int, pose: Floats) -> MotionPrior:
-        """The sweep's motion again, now that registration gave the `pose` (4, 4) at the stamp for `prior`.
+        """The sweep's motion by the velocity that the registered `pose` (4, 4) at the stamp implies; `prior` was used for it.
 
-        Continuing the change of velocity as well was tried: it amplifies jitter more than it follows bends.
+        Extrapolating the change of velocity as well was tried: it amplifies jitter more than it follows bends.
         """
         if prior.change is not None:
             return prior
@@ -208,9 +208,9 @@ class ConstantVelocity(Stateful, MotionModel):
     def correct(
         self, stamp_ns: int, pose: Floats, prior: MotionPrior | None = None, has_registration: bool = True
     ) -> None:
-        """Take the pose (4, 4) found at `stamp_ns` as the newest; `prior` says how its sweep moved.
+        """Update position and velocity by the pose (4, 4) at `stamp_ns`; `prior` is the motion within its sweep.
 
-        A pose without a registration (`has_registration`) is used alike.
+        A pose without a registration (`has_registration`) is used likewise.
         """
         middle, instant_ns = (pose, stamp_ns) if prior is None else middle_of(prior, stamp_ns, pose)
         if self._instant_ns is not None:
@@ -221,7 +221,7 @@ class ConstantVelocity(Stateful, MotionModel):
         self._predicted = None
 
     def _learn(self, velocity: Floats, step: float) -> None:
-        """Update with the velocity (6,) of a step of so many seconds, with bounded acceleration."""
+        """Update the velocity by one (6,) measured over `step` seconds, with bounded acceleration."""
         before, self._velocity = self._velocity, velocity
         if before is not None and self._step_s > 0:
             expected = self._twist / self._step_s

@@ -41,9 +41,9 @@ BEGIN_SIGMA = 1e-4
 
 
 def transition(step: Increments, R: Floats, R_end: Floats, gyroscope: Gyroscope) -> Floats:
-    """(N, N) by which errors at the first instant of `step` become errors at its last; N is 27, with the clocks' offset 28.
+    """(N, N) Jacobian of the errors at the last instant of `step` by those at the first; N is 27, or 28 with a clock offset.
 
-    R, R_end : (3, 3) of the IMU in the world at the two; gyroscope : that `step` was integrated with
+    R, R_end : (3, 3) of the IMU in the world at the two; gyroscope : the calibration that `step` was integrated with
     """
     t = float(step.seconds[-1])
     columns = gyroscope.columns(step)
@@ -65,7 +65,7 @@ def transition(step: Increments, R: Floats, R_end: Floats, gyroscope: Gyroscope)
 
 
 def process_noise(t: float, rate_variance: float, noise: ImuNoise = USUAL_NOISE) -> Floats:
-    """(27, 27) that `t` seconds add; rate_variance : (rad/s)^2 per Hz of the gyroscope."""
+    """(27, 27) covariance of the process noise over `t` seconds; rate_variance : (rad/s)^2 per Hz of the gyroscope."""
     Q = np.zeros((STATE_SIZE, STATE_SIZE))
     force = noise.force**2 * np.array([[t**3 / 3, t**2 / 2], [t**2 / 2, t]])
     for i, a in enumerate((PLACE, SPEED)):
@@ -78,12 +78,12 @@ def process_noise(t: float, rate_variance: float, noise: ImuNoise = USUAL_NOISE)
 
 
 def cut_noise(hidden: Floats, F: Floats) -> Floats:
-    """(N, N) that readings which the range cut off add over a step with the transition F (N, N).
+    """(N, N) covariance added by readings beyond the IMU's range, over a step with the transition F (N, N).
 
-    hidden : (6,) one sigma of the mean force and rate; white noise over the step that adds as much velocity and turn
+    hidden : (6,) one sigma of the mean force and rate; white noise over the step that adds as much velocity and rotation
 
-    A constant error of each step, another in the next, would put a pole of the filter at -1: where one position is found
-    wrong, it would take twice the speed that makes up for it, back and forth ever after. With white noise it is at sqrt(3) - 2.
+    An error constant within each step and independent of the next step's would put a pole of the filter at -1: a wrong position
+    would be compensated by twice the speed, back and forth without end. White noise puts it at sqrt(3) - 2.
     """
     turned, errors = F[TURN, GYRO][:, :3] * hidden[3:], np.zeros((len(F), 15))
     moved, pushed = F[PLACE, FORCE] * hidden[:3], F[SPEED, FORCE] * hidden[:3]
@@ -108,7 +108,7 @@ class Normal:
         return -linalg.solve(self.H, self.g)
 
     def without(self, out: NDArray[np.bool_]) -> Normal:
-        """The Schur complement: the variables `out` (N,) are marginalised."""
+        """Marginalise the variables marked in `out` (N,) by the Schur complement."""
         if not out.any():
             return self
         kept = ~out
@@ -131,7 +131,7 @@ def warm_up_solver() -> None:
 
 @dataclass(frozen=True)
 class NavigationState:
-    """Where the IMU is, and all that is known of its motion and its errors.
+    """State of the filter: pose, velocity, gravity and calibration of the IMU, with their covariance.
 
     T_world_imu : (4, 4); estimate : velocity, gravity, accelerometer bias and gyroscope, whose covariances are parts of
     covariance : (27, 27) of position, rotation (R' = exp(d) R), velocity, gravity, all in world axes, accelerometer bias,
@@ -152,7 +152,7 @@ class NavigationState:
         return cls(T_world_imu, estimate, P)
 
     def propagate(self, step: Increments) -> NavigationState:
-        """The state at the last instant of `step`, which this estimate integrated, with nothing but the IMU to go by."""
+        """The state at the last instant of `step`, which this estimate integrated, predicted by the IMU alone."""
         e, R, t = self.estimate, self.T_world_imu[:3, :3], float(step.seconds[-1])
         R_end, velocities, moved = step.motion(0, R, e.velocity, e.gravity)
         F = transition(step, R, R_end[-1], e.gyroscope)
@@ -166,7 +166,7 @@ class NavigationState:
         return NavigationState(T, replace(e, velocity=velocities[-1]), P)._share_covariance()
 
     def moved_to(self, T_world_imu: Floats, covariance: Floats) -> NavigationState:
-        """After the pose was found to be another (4, 4), with its `covariance` (6, 6), by what knows nothing of the rest."""
+        """The state after its pose became `T_world_imu` (4, 4) with `covariance` (6, 6); the rest follows by its correlation."""
         P = self.covariance
         gain = np.linalg.solve(P[POSE, POSE], P[POSE]).T
         d = pose_change(T_world_imu, self.T_world_imu)
@@ -175,7 +175,7 @@ class NavigationState:
         return replace(state, T_world_imu=T_world_imu)._share_covariance()
 
     def _shift(self, x: Floats, P: Floats) -> NavigationState:
-        """All states but the pose, moved by the error x (N,), with the covariance P."""
+        """The state with covariance P, all parts but the pose moved by the error x (N,)."""
         e, gyro = self.estimate, x[DEVICE]
         gyroscope = replace(
             e.gyroscope,
@@ -193,7 +193,7 @@ class NavigationState:
         return replace(self, estimate=e, covariance=P)
 
     def _with_gravity(self) -> NavigationState:
-        """Gravity is as long as it is all over the Earth; what that says of the pose is far below what registration does."""
+        """The state after an update by the known magnitude of gravity; its effect on the pose is negligible and omitted."""
         norm = float(np.linalg.norm(self.estimate.gravity))
         size = len(self.covariance)
         H = np.zeros((1, size))
@@ -210,10 +210,10 @@ class NavigationState:
 
 
 class FilterMotion(InertialMotion):
-    """Predicts a scan with its covariance, and takes what registration made of both as the update of all states.
+    """Predicts a scan with its covariance, and updates all states by the registered pose.
 
     An iterated update of a Kalman filter is a Gauss-Newton estimate with the prior as one more measurement (Bell and Cathey
-    1993). The points tell of the pose alone, so registration estimates that, and the other states follow by their
+    1993). The points observe the pose alone, so registration estimates that, and the other states follow by their
     covariance with it.
     """
 
@@ -225,7 +225,7 @@ class FilterMotion(InertialMotion):
     _posterior: tuple[int, NavigationState] | None = None
 
     def sweep(self, stamp_ns: int, span: Span) -> MotionPrior:
-        """As of any IMU, with the covariance of the pose at the stamp."""
+        """Predicted poses over the `span` of the sweep as by `InertialMotion`, with the covariance of the pose at the stamp."""
         prior = super().sweep(stamp_ns, span)
         self._next = self._posterior = None
         if not self.is_inertial or self._now is None or self._instant_ns is None:
@@ -241,9 +241,8 @@ class FilterMotion(InertialMotion):
     def refine(self, prior: MotionPrior, stamp_ns: int, pose: Floats) -> MotionPrior:
         """The prior itself: a sweep is deskewed once, by back propagation.
 
-        But where the range of the IMU cut readings, the states that the registered `pose` implies deskew it again: the speed
-        in the middle of the sweep is then off by all that the force lacked since the last one. The prior joins in with the
-        same covariance, which there is far wider than what it is registered with.
+        Where readings exceed the range of the IMU, the states that the registered `pose` implies deskew it again, since the speed
+        in the sweep lacks the force that was cut off. The covariance of the prior remains.
         """
         if prior.covariance is None or self._next is None:
             return super().refine(prior, stamp_ns, pose)
@@ -259,7 +258,7 @@ class FilterMotion(InertialMotion):
         return replace(swept, covariance=prior.covariance)
 
     def fuse(self, stamp_ns: int, result: RegistrationResult, prior: MotionPrior) -> RegistrationResult:
-        """The result as it is: its registration weighed points and prior already. The other states follow its pose."""
+        """Return the result unchanged: its registration used points and prior already. All other states are updated by its pose."""
         C = result.covariance
         if C is None or not result.is_accepted or prior.covariance is None or self._next is None:
             return result
@@ -273,7 +272,7 @@ class FilterMotion(InertialMotion):
     def correct(
         self, stamp_ns: int, pose: Floats, prior: MotionPrior | None = None, has_registration: bool = True
     ) -> None:
-        """As of any IMU; the states are those that the filter found."""
+        """Update as `InertialMotion.correct`; the states are those of the filter where the scan was fused or predicted by it."""
         predicted, posterior = self._next, self._posterior
         self._next = self._posterior = None
         before = self.estimate

@@ -32,7 +32,7 @@ log = logging.getLogger("lslam")
 class InertialMotion(Stateful):
     """Predicts with the IMU where it has samples, and with constant velocity where it has none.
 
-    opening : the IMU as a run opened it: cleaned, on the clock of the scans, and the estimate at the first scan, in the LiDAR
+    opening : the initialised IMU: cleaned, on the clock of the scans, and the estimate at the first scan, in the LiDAR
         frame there
     """
 
@@ -99,7 +99,7 @@ class InertialMotion(Stateful):
         return is_due and self._feels(stamp_ns, span)
 
     def sweep(self, stamp_ns: int, span: Span) -> MotionPrior:
-        """Poses over the `span` of the sweep; the one at the stamp when it takes no time."""
+        """Predicted poses over the `span` (s) of the sweep at `stamp_ns`, by the IMU, or constant velocity where it has a gap."""
         self.is_inertial = self._feels(stamp_ns, span)
         if not self.is_inertial:
             return self.coasting.sweep(stamp_ns, span)
@@ -109,7 +109,7 @@ class InertialMotion(Stateful):
         return prior
 
     def refine(self, prior: MotionPrior, stamp_ns: int, pose: Floats) -> MotionPrior:
-        """The sweep's motion again, now that registration gave the `pose` (4, 4) at the stamp for `prior`."""
+        """The motion within the sweep again, by the state that the registered `pose` (4, 4) at the stamp implies."""
         middle, instant_ns = middle_of(prior, stamp_ns, pose)
         end_ns = stamp_ns + round(1e9 * float(prior.times[-1]))
         is_swept = len(prior.times) > 1
@@ -121,11 +121,11 @@ class InertialMotion(Stateful):
         return self._prior(self._correct_estimate(instant_ns, middle), instant_ns, middle, stamp_ns, prior.times)
 
     def fuse(self, stamp_ns: int, result: RegistrationResult, prior: MotionPrior) -> RegistrationResult:
-        """The registered motion since the last scan weighed against what the IMU felt, each by its covariance.
+        """Fuse the registered motion since the last scan with the IMU's, each weighted by its covariance.
 
-        Where they contradict each other, it stays registration's, or the scan is bridged: `_reject`. Behind a gap nothing is
-        weighed: the scan before was deskewed without the IMU, and is wrong by more than its covariance says. prior : of
-        the registration, says how the sweep moved
+        Where they contradict each other, the registration is kept, or the scan is bridged: `_reject`. After a gap nothing is
+        fused: the scan before was deskewed without the IMU, and its error exceeds its covariance. prior : of the registration,
+        the motion within the sweep
         """
         C, is_off = result.covariance, not (self.config.weigh and self._is_filter)
         if C is None or not result.is_accepted or is_off or self._has_gap:
@@ -150,7 +150,7 @@ class InertialMotion(Stateful):
         return result.with_pose(pose, covariance)
 
     def _imu_motion(self, step: Increments) -> tuple[Floats, Floats]:
-        """How far, m, the IMU came over `step` from the newest pose, (3,), and the covariance (6, 6) of that and of its turn.
+        """Displacement (3,), m, of the IMU over `step` from the newest pose, and covariance (6, 6) of it and the rotation.
 
         All in world axes.
         """
@@ -164,11 +164,11 @@ class InertialMotion(Stateful):
     def _reject(
         self, stamp_ns: int, result: RegistrationResult, rest: Floats, covariance: Floats
     ) -> RegistrationResult:
-        """What comes of a registration that contradicts the IMU by `rest` (6,), m and rad: constant velocity decides.
+        """The outcome for a registration that contradicts the IMU by `rest` (6,), m and rad: constant velocity decides.
 
-        Where that is nearer to what the IMU expected, the scan is bridged: it stands where the IMU put it, as surely as
-        `covariance` (6, 6) says, and enters the map there, or the next would have nothing to stand on. Never twice in a row:
-        a registration that insists is right, the IMU may have been hit.
+        If constant velocity is closer to the IMU's prediction, the scan is bridged: it enters the map at the IMU's pose with
+        `covariance` (6, 6). Else the result is unchanged. Two scans in a row are never bridged, since a registration that repeats
+        itself is right: the IMU may have been hit.
         """
         if self._was_bridged or not self.coasting.is_known or self._expected is None:
             return result
@@ -182,9 +182,9 @@ class InertialMotion(Stateful):
     def correct(
         self, stamp_ns: int, pose: Floats, prior: MotionPrior | None = None, has_registration: bool = True
     ) -> None:
-        """Take the pose (4, 4) found at `stamp_ns` as the newest; `prior` says how its sweep moved.
+        """Update the estimate by the pose (4, 4) at `stamp_ns`; `prior` is the motion within its sweep.
 
-        Where no registration stands behind it (`has_registration`), it teaches nothing; the world begins with the first that has.
+        Without a registration (`has_registration`) the state is only propagated; the world begins with the first registered scan.
         """
         if self._instant_ns is None and not has_registration:
             return
@@ -224,9 +224,9 @@ class InertialMotion(Stateful):
         return None if self.refusal else self.estimate.summary
 
     def rewind(self, stamp_ns: int, pose: Floats, span: Span) -> MotionPrior:
-        """Forget all scans but the first, taken at `stamp_ns` and `pose` (4, 4); its sweep by what is known of the speed.
+        """Forget all scans but the first, taken at `stamp_ns` and `pose` (4, 4); returns its motion within the sweep.
 
-        An IMU knows the speed from the start: only one that begins later is ever asked.
+        It is needed only for an IMU that begins after the first scan: otherwise the speed is known from the start.
         """
         prior = self.coasting.rewind(stamp_ns, pose, span)
         self._pose, self._instant_ns = middle_of(prior, stamp_ns, pose)
@@ -254,7 +254,7 @@ class InertialMotion(Stateful):
         return MotionPrior(times, np.concatenate([poses[:k], poses[k + 1 :]]), has_imu_motion=True)
 
     def _correct_estimate(self, instant_ns: int, middle: Floats) -> ImuEstimate:
-        """The estimate at `instant_ns`, where registration put the LiDAR at `middle` (4, 4)."""
+        """The estimate at `instant_ns`, where the registered pose of the LiDAR is `middle` (4, 4)."""
         if self.config.velocity == "integrated":
             return self._propagate(instant_ns)
         if self.config.velocity == "along-x":
@@ -292,7 +292,7 @@ class InertialMotion(Stateful):
         return self.estimate.propagate(step, self.T_lidar_imu[:3, :3])
 
     def _restart(self, instant_ns: int, middle: Floats) -> None:
-        """After a gap, and a scan later, the velocity is that of registration over it, with a large covariance."""
+        """Reset the velocity, after a gap and one scan later, to that of registration, with a large covariance."""
         assert self._instant_ns is not None
         moved = (middle @ self.T_lidar_imu)[:3, 3] - (self._pose @ self.T_lidar_imu)[:3, 3]
         covariance = self.estimate.covariance.copy()
@@ -303,7 +303,7 @@ class InertialMotion(Stateful):
         self.estimate = ImuEstimate(moved / seconds, e.gravity, e.accel_bias, e.gyroscope, covariance)
 
     def _judge(self, stamp_ns: int, pose: Floats) -> None:
-        """Refuse an IMU that predicts scans clearly worse than constant velocity does."""
+        """Refuse the IMU (`refusal`) if it predicts scans clearly worse than constant velocity does."""
         assert self._instant_ns is not None
         if not self.coasting.is_known:
             return
@@ -333,7 +333,7 @@ class InertialMotion(Stateful):
 
 
 def warm_up() -> None:
-    """Compile or load what the first scans would otherwise wait for: three of a sensor that stands."""
+    """Compile or load the kernels of `InertialMotion` by three scans of a stationary sensor."""
     none = np.zeros(3)
     imu = ImuStream(
         np.arange(60, dtype=np.int64) * 10_000_000, np.tile([0.0, 0.0, GRAVITY], (60, 1)), np.zeros((60, 3))

@@ -34,7 +34,8 @@ ACCEL_WALK = 2e-3
 class ImuNoise:
     """Densities of white noise, per sqrt(Hz), and of the random walk of biases, per sqrt(s).
 
-    force : m/s2, of what no bias explains; rate : rad/s, the least, for more is learnt; accel_walk, gyro_walk : of the biases
+    force : m/s2, that no bias explains; rate : rad/s, a lower bound, since the actual one is estimated; accel_walk, gyro_walk :
+        of the biases
     """
 
     force: float = FORCE_NOISE
@@ -44,7 +45,7 @@ class ImuNoise:
 
     @classmethod
     def of(cls, config: ImuConfig) -> ImuNoise:
-        """What the configuration says of it, the defaults where it says nothing."""
+        """The configured densities, defaults for those that are not set."""
         c = config
         return cls(
             FORCE_NOISE if c.accel_noise is None else c.accel_noise,
@@ -77,13 +78,12 @@ MOUNTING = 0.5 * np.array(
 
 @dataclass(frozen=True)
 class Gyroscope:
-    """From readings to rates: axes @ (reading - bias), rad/s.
+    """Calibration of a gyroscope: rates are axes @ (reading - bias), rad/s.
 
     bias : (3,) rad/s; axes : (3, 3), the identity for a perfect device
     covariance : (12, 12) of the bias and of the rows of `axes`; (13, 13) where the offset of the clocks is estimated too
-    rate_variance : (rad/s)^2 per Hz, of what is left
-    noise : of the device, its accelerometer's too
-    offset_s : s to add to the stamps; has_mounting : whether what rotation there is in `axes` is the accelerometer's too
+    rate_variance : (rad/s)^2 per Hz of the residual noise; noise : of the device, its accelerometer's too
+    offset_s : s to add to the stamps; has_mounting : whether the rotation in `axes` applies to the accelerometer too
     """
 
     bias: Floats
@@ -101,7 +101,7 @@ class Gyroscope:
         return cls(bias, covariance=P, rate_variance=noise.rate**2, noise=noise)
 
     def with_calibration(self, mounting: bool, offset: bool) -> Gyroscope:
-        """This prior, not certain of its mounting or its clock, where these are to be estimated."""
+        """This prior with wide sigmas of mounting rotation and clock offset, for those that are to be estimated."""
         P = self.covariance
         if mounting:
             P = P.copy()
@@ -139,10 +139,7 @@ class Gyroscope:
 
     @property
     def tilt(self) -> tuple[float, float]:
-        """By how much an axis that the device feels lies beside the one that was turned about, rad, and one sigma.
-
-        Of the three, the one for which that is most certain: turns about one axis show as much, whatever the others are.
-        """
+        """Angle between a sensed and the actual axis of rotation, rad, and its sigma, for the most significant of three axes."""
         best = (0.0, np.inf)
         for k in range(3):
             off = np.delete(self.axes[:, k], k)
@@ -167,7 +164,7 @@ class Gyroscope:
         )
 
     def learn(self, step: Increments, rest: Floats, noise: Floats) -> Gyroscope:
-        """After registration found the turn over `step` larger by `rest` (3,) rad, itself known to `noise` (3, 3), rad2.
+        """Update by a registered rotation over `step` that is larger by `rest` (3,), rad, with covariance `noise` (3, 3), rad2.
 
         `rest` and `noise` are in IMU axes at the end of the step.
         """
@@ -188,10 +185,7 @@ class Gyroscope:
         return self._update(x, P, excess, step)
 
     def with_bias(self, bias: Floats, covariance: Floats) -> Gyroscope:
-        """After another estimate, which knows nothing of the rest, found this `bias` (3,), with its `covariance` (3, 3).
-
-        The rest follows by its covariance with the bias, as the states of a filter follow a pose.
-        """
+        """The calibration with the bias (3,) and `covariance` (3, 3) of another estimate; the rest follows by its correlation."""
         P = self.covariance
         gain = np.linalg.solve(P[:3, :3], P[:3]).T
         d = gain @ (bias - self.bias)
@@ -217,7 +211,7 @@ class Gyroscope:
         return np.column_stack([H, step.rotations[-1].T @ begin - end])
 
     def _learnt_with_offset(self, step: Increments, rest: Floats, noise: Floats) -> Gyroscope:
-        """As `kalman.correct_turn`, with one state more."""
+        """The update of `learn` by `kalman.update` with the clock offset as a thirteenth state."""
         walk = np.zeros(13)
         walk[:3], walk[12] = self.noise.gyro_walk**2 * step.duration, OFFSET_WALK**2 * step.duration
         before = self.covariance + np.diag(walk)

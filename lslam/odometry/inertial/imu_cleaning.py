@@ -56,10 +56,10 @@ class CleanStream:
 
 
 def clean(imu: ImuStream, first_ns: int, last_ns: int) -> CleanStream:
-    """Drop what is not finite or goes back in time, convert g to m/s2.
+    """Drop samples that are not finite or go back in time, convert g to m/s2, fill in saturated readings.
 
-    Raises ImuRefusedError for a stream that says nothing about the time from `first_ns` to `last_ns`, stands still, has too
-    many bad samples, or measures no gravity.
+    Raises ImuRefusedError for a stream without samples between `first_ns` and `last_ns`, with constant readings, too many bad
+    samples, or no gravity.
     """
     notes: list[str] = []
     imu = _sort(imu, notes)
@@ -114,10 +114,10 @@ def mean_forces(imu: ImuStream) -> Floats:
 
 
 def gaps(imu: ImuStream | WheelStream, longest_s: float) -> Longs:
-    """(G, 2) ns: begin and end of every stretch that no sample tells of, before and after all included.
+    """(G, 2) ns: begin and end of every stretch without samples, before the first and after the last included.
 
-    In a pause longer than `longest_s` half of that after the last sample and before the next is still known as well as in
-    one that is no longer. Pauses of a slow stream are not gaps: half a step more than usual is.
+    A pause is a gap if it exceeds `longest_s` and 1.5 times the median step; half of that limit next to each sample does not
+    count as gap, so that short and long pauses are treated alike.
     """
     steps = np.diff(imu.stamps_ns)
     limit = max(1e9 * longest_s, 1.5 * float(np.median(steps)))
@@ -135,7 +135,7 @@ def covers(silent: Longs, begin_ns: int, end_ns: int) -> bool:
 
 
 def _sort(imu: ImuStream, notes: list[str]) -> ImuStream:
-    """Finite samples in increasing time."""
+    """Finite samples in increasing time; raises ImuRefusedError if too many of them are bad, or fewer than two remain."""
     finite = np.isfinite(imu.accel).all(axis=1) & np.isfinite(imu.gyro).all(axis=1)
     latest = np.maximum.accumulate(imu.stamps_ns) if len(imu) else imu.stamps_ns
     ahead = np.ones(len(imu), bool)
@@ -153,6 +153,7 @@ def _sort(imu: ImuStream, notes: list[str]) -> ImuStream:
 
 
 def _in_si(imu: ImuStream, notes: list[str]) -> Floats:
+    """Accelerations in m/s2, converted where the mean magnitude is in g; raises ImuRefusedError where it is neither."""
     norm, unit = gravity_unit(imu)
     if unit is None:
         raise ImuRefusedError(
@@ -187,10 +188,10 @@ FORGOTTEN_S = 0.2
 
 
 def fill_saturation(imu: ImuStream, notes: list[str]) -> ImuStream:
-    """The stream with what its range cut off filled in, and one sigma of that as `hidden`; the same where nothing was.
+    """The stream with readings beyond its range estimated, and their sigmas as `clipping_sigma`; unchanged without such.
 
-    Over a cut the reading goes on with the slopes it has at the edges and flattens towards its top, yet not beyond
-    `HIDDEN_RANGE_SHARE` of the range; its sigma is what was added, and more the farther the edges are.
+    Over a cut the reading continues with the slopes at its edges and flattens towards the top, within `HIDDEN_RANGE_SHARE`
+    of the range; its sigma is the amount added, and more the farther the edges are.
     """
     if imu.clipping_sigma is not None:
         # Filled before: what it was filled with is no range.
@@ -218,11 +219,10 @@ def fill_saturation(imu: ImuStream, notes: list[str]) -> ImuStream:
 
 
 def _cuts(values: Floats, least: float) -> Bools:
-    """(M, 3) where readings (M, 3) sit at an end of the range, which is `least` or more either way.
+    """(M, 3) whether each reading (M, 3) is at an end of the device's range, which is at least `least`.
 
     Every axis has an upper and a lower end of its own: 16 bits read from -32768 to +32767, and scales differ. An extreme is
-    an end where it stands in a row, `PILED_RATIO`, or is within a bit of one that does; not where others of the device go far
-    beyond.
+    an end if it repeats in a row, piles up (`PILED_RATIO`), or is within a bit of such an end; not if other axes read far beyond.
     """
     if len(values) < ROW_SAMPLES:
         return np.zeros(values.shape, bool)
@@ -240,7 +240,7 @@ def _cuts(values: Floats, least: float) -> Bools:
 
 
 def _excess(seconds: Floats, values: Floats, at_limit: Bools) -> Floats:
-    """(2, M) by how much readings (M,) at an end of the range were likely beyond it, and one sigma of that."""
+    """(2, M) estimated amount by which the readings (M,) at an end of the range exceeded it, and its sigma."""
     beyond = np.zeros((2, len(values)))
     size = np.abs(values)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], at_limit, [False]]).astype(np.int8)))

@@ -29,7 +29,7 @@ WORSE_RATIO = 2.0
 
 
 class PredictionErrors(Stateful):
-    """How wrong, m, a sensor and constant velocity predicted the scans, turns counted at `LEVER_M`."""
+    """Prediction errors, m, of a sensor and of constant velocity over the newest scans, rotations multiplied by `LEVER_M`."""
 
     # Scans over which the sensor's median error is tested against constant velocity, and the slack of the test.
     JUDGED, SLACK_M = 30, 0.02
@@ -38,7 +38,7 @@ class PredictionErrors(Stateful):
         self._pairs: list[tuple[float, float]] = []
 
     def observe(self, own: float, steady: float) -> tuple[float, float] | None:
-        """Take the errors of a scan's predictions: the medians of the newest, where the sensor is clearly worse; else None."""
+        """Add the errors of a scan; returns both medians over the newest scans if the sensor is clearly worse, else None."""
         self._pairs.append((own, steady))
         if len(self._pairs) < self.JUDGED:
             return None
@@ -80,7 +80,7 @@ VELOCITY, DOWN, BIAS = slice(0, 3), slice(3, 6), slice(6, 9)
 
 @dataclass(frozen=True)
 class ImuEstimate:
-    """Velocity of the IMU and gravity in the world, bias of its forces in IMU axes; SI units.
+    """Velocity of the IMU and gravity in the world, accelerometer bias in IMU axes; SI units.
 
     covariance : (9, 9) of velocity, gravity and accelerometer bias
     """
@@ -102,7 +102,7 @@ class ImuEstimate:
 
     @property
     def summary(self) -> ImuState:
-        """Means and standard deviations, for people; NaN for what is not estimated."""
+        """Means and standard deviations of biases, gravity, mounting and clock offset, for reports; NaN if not estimated."""
         g = self.gyroscope
         values, variances = np.full(13, np.nan), np.full(13, np.nan)
         values[:9] = np.concatenate([self.accel_bias, g.bias, self.gravity])
@@ -155,11 +155,11 @@ class ImuEstimate:
     ) -> ImuEstimate:
         """The estimate at the last instant of `step`, updated by the registered motion over it.
 
-        step : as this estimate finds it `over` the two instants
+        step : integrated by this estimate (`over`) between the two instants
         R, R_end : (3, 3) of the IMU in the world at the first and the last instant
         displacement : (3,) m in between
-        gyroscope : as `calibrate` has it of the turn
-        noise : (3, 3) m2, world axes, of either place; None for a registration without covariance
+        gyroscope : its calibration after the same motion (`calibrate`)
+        noise : (3, 3) m2, world axes, of either position; None for a registration without covariance
         """
         rest = vector_between(R @ step.rotations[-1], R_end)
         # The shape of the turn is the gyroscope's, its sum is registration's.
@@ -174,6 +174,7 @@ class ImuEstimate:
         return self._with(x[3:], P[3:, 3:], step, gyroscope)
 
     def _with(self, x: Floats, P: Floats, step: Increments, gyroscope: Gyroscope | None = None) -> ImuEstimate:
+        """The estimate of mean x (9,) and covariance P plus random walks; a changed mounting also changes the bias."""
         # Velocity, gravity and accelerometer bias.
         P = P + np.diag(np.repeat([0.0, GRAVITY_WALK**2, self.gyroscope.noise.accel_walk**2], 3)) * step.duration
         device = self.gyroscope if gyroscope is None else gyroscope

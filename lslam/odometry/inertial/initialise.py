@@ -38,9 +38,9 @@ GRAVITY_S = 3.0
 class FirstPoses:
     """The registration of the first seconds without an IMU.
 
-    stamps_ns (N,), poses (N, 4, 4) : at the starts of the scans, the first scan's first
-    instants_ns (M,), middles (M, 4, 4) : in the middle of sweeps, where turns are known best
-    covariances : (M, 6, 6) of the registrations, world axes; None when they say nothing of their quality
+    stamps_ns (N,), poses (N, 4, 4) : at the stamps of the scans
+    instants_ns (M,), middles (M, 4, 4) : in the middle of sweeps, where rotations are most accurate
+    covariances : (M, 6, 6) of the registrations, world axes; None when unknown
     """
 
     stamps_ns: Longs
@@ -85,9 +85,9 @@ def start(
     config: ImuConfig,
     least_offset_s: float = LEAST_OFFSET_S,
 ) -> InertialStart:
-    """Check the stream against the first poses that registration found, and align it with them.
+    """Check the stream against the registered first poses, and initialise velocity, gravity and biases by them.
 
-    last_ns : stamp of the recording's last scan; least_offset_s : differences of the clocks below it are none
+    last_ns : stamp of the recording's last scan; least_offset_s : smaller clock offsets are taken as zero
 
     Raises ImuRefusedError with the reason when the stream cannot be of this sensor's motion.
     """
@@ -127,9 +127,9 @@ def start(
 
 
 def told_poses(first: FirstPoses, imu: ImuStream) -> tuple[FirstPoses, FirstPoses]:
-    """The longest time among the first scans that the stream tells of, and how far it does from the very first on.
+    """The longest stretch of the first scans that the stream covers, and the covered stretch from the very first scan on.
 
-    Raises ImuRefusedError when it is silent between all of them.
+    Raises ImuRefusedError when it covers no two successive scans.
     """
     silent = gaps(imu, IMU_GAP_S)
     ends = [k + 1 for k, (a, b) in enumerate(pairwise(first.stamps_ns)) if not covers(silent, int(a), int(b))]
@@ -146,9 +146,9 @@ def told_poses(first: FirstPoses, imu: ImuStream) -> tuple[FirstPoses, FirstPose
 
 
 def _refuse_sign(imu: ImuStream, T_lidar_imu: Floats, part: FirstPoses, gyro_bias: Floats | None) -> None:
-    """Refuse forces that lead along the scans' path when they point the other way: at rest +g is up (REP 145).
+    """Raise ImuRefusedError where inverted forces fit the scans' path far better: at rest +g must be up (REP 145).
 
-    Where the sensor stood, the path is what registration errs by, and tells nothing of the IMU.
+    A stationary sensor is not tested: its path is only registration noise.
     """
     if _farthest(part.poses) < STILL_M:
         return
@@ -169,7 +169,10 @@ def _refuse_sign(imu: ImuStream, T_lidar_imu: Floats, part: FirstPoses, gyro_bia
 
 
 def _without_wrong_bias(config: ImuConfig, scan_bias: Floats | None, problems: list[str]) -> ImuConfig:
-    """A given bias that the scans contradict is another device's: a preset's, say."""
+    """The configuration without its gyroscope and accelerometer bias, if the former contradicts `scan_bias` (3,), rad/s.
+
+    The scans' bias is None if unknown. A dropped bias, for example a preset's of another device, adds one of the `problems`.
+    """
     if config.gyro_bias is None or scan_bias is None:
         return config
     off = float(np.abs(np.array(config.gyro_bias) - scan_bias).max())
@@ -196,7 +199,11 @@ def _first_guess(
     config: ImuConfig,
     mean_bias: Floats | None,
 ) -> tuple[ImuEstimate, bool]:
-    """Biases as given, or of a standing sensor, or by the mean turn; gravity as the scans' path and the forces need it."""
+    """Initial estimate with its covariance, and whether the sensor is stationary in the first second.
+
+    The gyroscope bias is the configured one, else the mean rate of a stationary sensor, else `mean_bias`. Gravity follows from
+    forces and path.
+    """
     stands, rates = _is_stationary(imu, stamps_ns, poses)
     gyro_bias, gyro_sigma = (np.zeros(3), ANY_GYRO_BIAS) if mean_bias is None else (mean_bias, MEAN_GYRO_BIAS)
     if stands:
@@ -218,7 +225,7 @@ def _first_guess(
 
 
 def _is_stationary(imu: ImuStream, stamps_ns: Longs, poses: Floats) -> tuple[bool, Floats]:
-    """Whether the first second is one of standing still, and the mean rates (3,) in it."""
+    """Whether the sensor is stationary in the first second, and the mean rates (3,), rad/s, in it."""
     end_ns = stamps_ns[0] + 1_000_000_000
     i, j = (int(k) for k in np.searchsorted(imu.stamps_ns, [stamps_ns[0], end_ns]))
     within = stamps_ns < end_ns
@@ -237,7 +244,7 @@ def _farthest(poses: Floats) -> float:
 def _learn(
     imu: ImuStream, T_lidar_imu: Floats, guess: ImuEstimate, part: FirstPoses, opening: FirstPoses, config: ImuConfig
 ) -> ImuEstimate:
-    """The guess after all the sweeps, with the velocity at the first pose."""
+    """The guess updated by all sweeps of `part`, with the velocity at the first pose of `opening`."""
     T = part.middles @ T_lidar_imu
     learnt = guess
     for k in range(len(T) - 1):
@@ -260,9 +267,9 @@ def _learn(
 def _path_of_force(
     imu: ImuStream, T_world_imu: Floats, stamps_ns: Longs, prior: ImuEstimate, seconds: float
 ) -> tuple[Floats, Floats, float]:
-    """Velocity at the first pose (3,), gravity (3,) and the velocity's sigma that lead along the poses of some seconds.
+    """Velocity at the first pose (3,) and gravity (3,) that fit the poses of the first `seconds` best, and the velocity's sigma.
 
-    Where `prior` has a gravity, it is kept and only the velocity is looked for.
+    If `prior` has a gravity, that is kept and only the velocity is estimated.
     """
     count = max(int(np.searchsorted(stamps_ns, stamps_ns[0] + round(1e9 * seconds))), min(4, len(stamps_ns)))
     has_gravity = bool(prior.gravity.any())

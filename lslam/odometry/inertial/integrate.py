@@ -15,12 +15,12 @@ PERFECT = np.eye(3)
 
 @dataclass(frozen=True)
 class Increments:
-    """What an IMU felt since the first of some instants, in its own axes at that instant, gravity not removed.
+    """Preintegrated IMU readings since the first of some instants, in IMU axes at that instant, gravity not removed.
 
     instants_ns : (K,) increasing; rotations : (K, 3, 3) from the IMU then to the IMU at the first instant
     velocities (K, 3), positions (K, 3) : the specific force integrated once and twice, m/s and m
-    velocity_arms, position_arms : (K, 3, 3) likewise of the rotations: what a constant force in IMU axes adds
-    imu, offset_ns : the stream, and what was added to its stamps
+    velocity_arms, position_arms : (K, 3, 3) rotations integrated likewise: the effect of a constant force in IMU axes
+    imu, offset_ns : the stream, and the offset added to its stamps
     hidden : (6,) one sigma of the mean force and rate, to the last instant, that the range of the IMU cut off; None for none
     """
 
@@ -91,9 +91,9 @@ def integrate(
     mounting: Floats | None = None,
     offset_ns: int = 0,
 ) -> Increments:
-    """Integrate the stream over increasing `instants_ns` (K,), K >= 1, with the biases (3,) taken off.
+    """Integrate the stream over increasing `instants_ns` (K,), K >= 1, with the biases (3,) subtracted.
 
-    gyro_axes : (3, 3) that makes true rates of the gyroscope's readings less their bias; None takes them as they are
+    gyro_axes : (3, 3) from the gyroscope's readings less their bias to true rates; None: the identity
     mounting : (3, 3) likewise of the forces; offset_ns : to add to the stamps of the stream
 
     Readings are linear between samples and constant beyond the ends of the stream, so the result does not depend on how the

@@ -40,10 +40,10 @@ def smoother_noise(noise: ImuNoise) -> SmootherNoise:
 
 
 class SmootherMotion(InertialMotion):
-    """Predicts with the newest state of a smoother, which takes each registered pose as a measurement beside the IMU's.
+    """Predicts with the newest state of a smoother, in which registered poses and the IMU are measurements.
 
-    States are at the middles of the sweeps. The errors of the gyroscope's axes, which the smoother has none of, are calibrated
-    as with any IMU, and taken off its readings, as the bias at the start is.
+    States are at the middles of the sweeps. The smoother has no gyroscope axes: these are calibrated as by `InertialMotion`,
+    and readings are corrected by them and by the initial bias.
     """
 
     HAS_DEVICE: ClassVar[bool] = False
@@ -66,7 +66,7 @@ class SmootherMotion(InertialMotion):
         return prior if self.is_inertial else super().refine(prior, stamp_ns, pose)
 
     def fuse(self, stamp_ns: int, result: RegistrationResult, prior: MotionPrior) -> RegistrationResult:
-        """The pose that the smoother makes of registration and IMU, with its covariance."""
+        """The result with the pose and covariance that the smoother estimates from registration and IMU."""
         self._withdraw()
         C = result.covariance
         middle, instant_ns = middle_of(prior, stamp_ns, result.T_world_lidar)
@@ -94,7 +94,7 @@ class SmootherMotion(InertialMotion):
     def correct(
         self, stamp_ns: int, pose: Floats, prior: MotionPrior | None = None, has_registration: bool = True
     ) -> None:
-        """As of any IMU; velocity, gravity and biases are the smoother's."""
+        """Update as `InertialMotion.correct`; velocity, gravity and biases are the smoother's."""
         if not has_registration:
             self._withdraw()
         added, self._added = self._added, None
@@ -131,7 +131,7 @@ class SmootherMotion(InertialMotion):
             return None
 
     def chain(self, keyframes: Sequence[tuple[int, int]], imu_noise: SmootherNoise) -> InertialChain | None:
-        """The IMU between these keyframes, numbers and stamps in ns, by what is known of it now; None where it was silent."""
+        """Preintegrated links between `keyframes` (number, stamp in ns), for the pose graph; None where the IMU covers none."""
         links = []
         for (a, begin_ns), (b, end_ns) in pairwise(keyframes):
             if end_ns > begin_ns and self._covers(begin_ns, end_ns):
@@ -144,7 +144,7 @@ class SmootherMotion(InertialMotion):
         return InertialChain(links, R @ opening.accel_bias, R @ opening.gyro_bias, imu_noise)
 
     def _at_lidar(self, step: InertialStep) -> InertialStep:
-        """The readings of an IMU in the place and axes of the LiDAR, its biases but turned."""
+        """The readings that an IMU in the position and axes of the LiDAR would give, with the same biases, rotated."""
         R, lever = self.T_lidar_imu[:3, :3], self.T_imu_lidar[:3, 3]
         rates = step.rates - self._beginning().gyro_bias
         middles = np.cumsum(step.seconds) - 0.5 * step.seconds
@@ -175,7 +175,7 @@ class SmootherMotion(InertialMotion):
     def _measurement(
         self, step: Increments, T_world_imu: Floats | None = None, C: Floats | None = None
     ) -> InertialStep:
-        """The readings of `step` between their samples, linear there, and the registered pose at its end."""
+        """The readings of `step` at the midpoints between samples, and the registered pose with covariance C at its end."""
         begin_ns, end_ns = int(step.instants_ns[0]), int(step.instants_ns[-1])
         stamps = self.imu.stamps_ns
         inner = stamps[np.searchsorted(stamps, begin_ns, side="right") : np.searchsorted(stamps, end_ns)]
@@ -200,6 +200,7 @@ class SmootherMotion(InertialMotion):
         )
 
     def _beginning(self) -> InertialState:
+        """Initial state of a smoother: the newest pose and the present estimate, with wide sigmas of the pose."""
         e = self.estimate
         P = np.zeros((18, 18))
         P[:6, :6] = BEGIN_SIGMA**2 * np.eye(6)
@@ -210,7 +211,7 @@ class SmootherMotion(InertialMotion):
         return InertialState(self._pose @ self.T_lidar_imu, e.velocity, e.accel_bias, bias, e.gravity, P)
 
     def _as_estimate(self, state: InertialState) -> ImuEstimate:
-        """The state as what predicts; the gyroscope's axes and noise are the calibration's, which follows the bias."""
+        """The smoother's state as the estimate that predicts; the gyroscope's axes remain those of the calibration."""
         device = self.estimate.gyroscope
         unturned = np.linalg.inv(device.axes)
         gyroscope = device.with_bias(

@@ -53,9 +53,9 @@ class WheelCalibration:
     """States of the wheels and their covariance.
 
     up : (3,) axis of the yaw rate in LiDAR axes; has_yaw : whether it is measured
-    states (9,), covariance (9, 9) : u; arm from the LiDAR to the axle, m; scale and offset, rad/s, of the yaw rate; s to
-        add to stamps
-    noise : (3,) of what is left, m2 per m along u and across, and rad2 per s; counts : (3,) steps behind it
+    states (9,), covariance (9, 9) : u, the driving direction times the scale; arm from the LiDAR to the axle, m; scale and
+        offset, rad/s, of the yaw rate; s to add to stamps
+    noise : (3,) densities of the residual, m2 per m along u and across, and rad2 per s; counts : (3,) steps used for it
     """
 
     up: Floats
@@ -67,7 +67,7 @@ class WheelCalibration:
 
     @classmethod
     def of(cls, wheels: WheelStream) -> WheelCalibration:
-        """The prior: as the frame of the wheels says, or forward along x of the LiDAR where nothing places it."""
+        """The prior: by the frame of the wheels, or forward along x of the LiDAR with wide sigmas where that is unknown."""
         T = np.eye(4) if wheels.T_lidar_base is None else wheels.T_lidar_base
         spread, arm_sigma = [SCALE_SIGMA, AXIS_SIGMA, AXIS_SIGMA], ARM_SIGMA
         if wheels.T_lidar_base is None:
@@ -91,7 +91,7 @@ class WheelCalibration:
         return float(np.linalg.norm(self.states[U])), float(np.sqrt(u @ self.covariance[U, U] @ u))
 
     def step(self, wheels: WheelStream, begin_ns: int, end_ns: int, yaw_rate: float) -> WheelStep:
-        """Motion from one instant to a later one; `yaw_rate`, rad/s, is for wheels that measure none."""
+        """Motion from `begin_ns` to `end_ns`; `yaw_rate`, rad/s, is used for wheels that measure none."""
         offset_ns, up = round(1e9 * float(self.states[OFFSET_S])), self.up
         first, last = np.searchsorted(wheels.stamps_ns, [begin_ns - offset_ns, end_ns - offset_ns])
         around = slice(max(int(first) - 1, 0), int(last) + 1)
@@ -124,7 +124,7 @@ class WheelCalibration:
         return WheelStep(se3.make(R, moved), J, abs(way), seconds)
 
     def step_noise(self, step: WheelStep) -> Floats:
-        """(4, 4) covariance of a step that no state explains."""
+        """(4, 4) covariance of a step's translation (m) and rotation about `up` (rad) that the states do not explain."""
         along, across, turning = self.noise
         out = np.zeros((4, 4))
         out[:3, :3] = step.way * by_axis(along, across, self.direction)
@@ -138,7 +138,7 @@ class WheelCalibration:
         return np.asarray(step.jacobian @ self.covariance @ step.jacobian.T)
 
     def correct(self, step: WheelStep, rest: Floats, C: Floats) -> WheelCalibration:
-        """After registration found a step longer by `rest` (4,), m and rad about `up`, with the covariance C (4, 4)."""
+        """Update by a registered step that is longer by `rest` (4,), m and rad about `up`, with covariance C (4, 4)."""
         P, J, size = self.covariance.copy(), step.jacobian.copy(), 4 if self.has_yaw else 3
         # By the registered turn: the noise of the measured one would be taken for a scale that is too large.
         J[3, YAW_SCALE] += self.has_yaw * rest[3] / self.states[YAW_SCALE]
@@ -171,12 +171,12 @@ def squares_along(rest: Floats, C: Floats, direction: Floats) -> tuple[Floats, F
 def learn_noise(
     noise: Floats, counts: Floats, squares: Floats, others: Floats, per: Floats, least: Floats
 ) -> tuple[Floats, Floats]:
-    """Densities of noise (N,), and the counts behind them, after squared innovations (N,) over so much each, `per` (N,).
+    """Noise densities (N,) and their counts, updated by squared innovations (N,); per : (N,) m or s of each.
 
-    others : (N,) part of the squares that is not this noise's. Half of the squares of a normal error lie below `MEDIAN_SQUARE` of
-    its variance: a density grows with each one above, and shrinks with each below, so that slip, however much, counts as one
-    innovation. One counts by the share that is not known: along a direction that registration leaves open it tells nothing. What
-    neither explains, beyond `INNOVATION_SIGMAS`, counts in full.
+    others : (N,) part of the squares that is other noise. Half of the squares of a normal error lie below `MEDIAN_SQUARE` of
+    its variance: a density grows with each one above, and shrinks with each below, so that slip of any size counts as one
+    innovation. Each is weighted by the share of this noise in it: along a direction that registration does not observe it is
+    zero. Innovations beyond `INNOVATION_SIGMAS` count in full.
     """
     own = noise * per
     is_beyond = squares > INNOVATION_SIGMAS**2 * (own + others)

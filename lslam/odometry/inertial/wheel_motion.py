@@ -73,11 +73,11 @@ class LearntFromScan:
 
 
 class WheelMotion(ConstantVelocity):
-    """Constant velocity whose way and turn from scan to scan are those of the wheels, as far as these predict them better.
+    """Constant velocity, corrected by the wheels' translation and yaw between scans as far as these predict better.
 
-    Both predictions are averaged by the noise of each, which is learnt while driving: wheels of another robot have no weight. A
-    registered motion is weighed against the wheels by the covariances of both. Tyres hold no more than gravity: a speed of the
-    wheels that changes faster is slip, and constant velocity goes on. The motion within a sweep is that of constant velocity.
+    Both predictions are averaged by their noise, which is estimated while driving: wheels of another robot get no weight. A
+    registered motion is fused with the wheels' by the covariances of both. Tyres transmit no more than gravity: a speed of the
+    wheels that changes faster is slip, and constant velocity is used. The motion within a sweep is that of constant velocity.
     """
 
     STATE: ClassVar[tuple[str, ...]] = (
@@ -133,9 +133,9 @@ class WheelMotion(ConstantVelocity):
         return replace(prior, poses=self._reckoned.pose @ se3.relative(prior.pose, prior.poses))
 
     def fuse(self, stamp_ns: int, result: RegistrationResult, prior: MotionPrior) -> RegistrationResult:
-        """The registered motion since the last scan weighed against the wheels', each by its covariance.
+        """Fuse the registered motion since the last scan with the wheels', each weighted by its covariance.
 
-        prior : of the registration, says how the sweep moved
+        A registration that contradicts both wheels and constant velocity is rejected. prior : motion within the sweep
         """
         middle, instant_ns = middle_of(prior, stamp_ns, result.T_world_lidar)
         if result.covariance is None or not result.is_accepted:
@@ -165,7 +165,7 @@ class WheelMotion(ConstantVelocity):
     def correct(
         self, stamp_ns: int, pose: Floats, prior: MotionPrior | None = None, has_registration: bool = True
     ) -> None:
-        """Take the pose (4, 4) found at `stamp_ns` as the newest; `prior` says how its sweep moved."""
+        """Update by the pose (4, 4) at `stamp_ns`, and adopt the calibration of `fuse`; `prior` is the motion within the sweep."""
         _, instant_ns = (pose, stamp_ns) if prior is None else middle_of(prior, stamp_ns, pose)
         reckoning, learnt_now = self._reckoned, self._learnt
         if reckoning is not None:
@@ -193,7 +193,7 @@ class WheelMotion(ConstantVelocity):
         return bool(apart(steady, reckoning.wheels.pose, LEVER_M) < apart(steady, registered, LEVER_M))
 
     def _judge(self, own: float, steady: float) -> None:
-        """Refuse wheels that predict scans clearly worse than constant velocity does, as an IMU is refused."""
+        """Refuse wheels whose prediction errors (m) are clearly larger than those of constant velocity (`steady`)."""
         worse = self.errors.observe(own, steady)
         if worse is not None and not self.refusal:
             self.refusal = (
@@ -203,7 +203,7 @@ class WheelMotion(ConstantVelocity):
             log.warning("the wheels are refused from here on: %s", self.refusal)
 
     def _reckon(self, instant_ns: int) -> ReckonedStep | None:
-        """The step from the newest pose to an instant; None where there is none, or wheels say nothing of it."""
+        """Predicted step from the newest pose to `instant_ns`, of wheels and constant velocity; None in a gap or after refusal."""
         begin_ns = self._instant_ns
         if self.refusal or begin_ns is None or instant_ns <= begin_ns or not covers(self._gaps, begin_ns, instant_ns):
             return None
@@ -233,7 +233,7 @@ class WheelMotion(ConstantVelocity):
         return ReckonedStep(pose, self.calibration.state_covariance(wheels) + noise + lost, wheels, steady, is_slip)
 
     def _learn_from(self, reckoning: ReckonedStep, instant_ns: int, middle: Floats, C: Floats) -> LearntFromScan:
-        """What the registered `middle` (4, 4) with covariance C (6, 6) tells of the wheels and of constant velocity."""
+        """Calibration and noise updated by the registered pose `middle` (4, 4) with covariance C (6, 6), and prediction errors."""
         up, B = self.calibration.up, np.zeros((4, 6))
         B[:3, :3], B[3, 3:] = self._pose[:3, :3].T, self._pose[:3, :3] @ up
         # Both ends of the step were registered.
@@ -274,7 +274,7 @@ def _size(rest: Floats) -> float:
 
 
 def warm_up() -> None:
-    """Compile or load what the first scans would otherwise wait for."""
+    """Compile or load the kernels of wheel motion by three scans."""
     wheels = WheelStream(np.arange(20, dtype=np.int64) * 20_000_000, np.ones(20), np.zeros(20))
     motion = WheelMotion(wheels)
     for k in range(3):
@@ -293,7 +293,7 @@ class Wheels:
 
 
 def begin_wheels(sequence: Sequence, config: WheelsConfig) -> Wheels:
-    """Read the wheels that the configuration names. Raises InputError and UsageError as `read_wheels`."""
+    """Read the configured wheels and make their motion model. Raises InputError and UsageError as `read_wheels`."""
     if not config.source:
         return Wheels()
     part = Wheels()
@@ -311,9 +311,9 @@ def begin_wheels(sequence: Sequence, config: WheelsConfig) -> Wheels:
 
 
 def close_wheels(part: Wheels, ignores_prior: bool) -> dict[str, Any]:
-    """What the manifest says of the wheels when the run is over, nothing without; `part` gets the problems on the way.
+    """Facts about the wheels for the manifest, empty without wheels; problems of the run are appended to those of `part`.
 
-    ignores_prior : of the method
+    ignores_prior : whether the method predicts by itself
     """
     motion = part.motion
     if motion is None:

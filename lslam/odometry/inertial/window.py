@@ -52,9 +52,9 @@ MOST_STEPS = 5
 
 @dataclass(frozen=True)
 class Moment:
-    """The IMU in the middle of a sweep: pose (4, 4), velocity and accelerometer and gyroscope bias (3,).
+    """State of the IMU in the middle of a sweep: pose (4, 4), velocity and accelerometer and gyroscope bias (3,).
 
-    T_imu_scan : (4, 4) from it to the LiDAR at the scan's stamp; equations : what the points say of that; None: nothing
+    T_imu_scan : (4, 4) from it to the LiDAR at the scan's stamp; equations : normal equations of its points, None without
     """
 
     instant_ns: int
@@ -72,7 +72,7 @@ class Moment:
         return np.asarray(self.T_world_imu @ self.T_imu_scan)
 
     def retract(self, d: Floats) -> Moment:
-        """After an error d (15,)."""
+        """This state moved by an error d (15,): position, rotation (left), velocity, accelerometer and gyroscope bias."""
         T = se3.make(so3.exp(d[3:6]) @ self.T_world_imu[:3, :3], self.T_world_imu[:3, 3] + d[:3])
         return replace(
             self,
@@ -83,7 +83,7 @@ class Moment:
         )
 
     def away(self, other: Moment) -> Floats:
-        """(15,) error by which this is away from another."""
+        """(15,) error of this state relative to `other`."""
         return np.concatenate(
             [
                 off_by(other.T_world_imu, self.T_world_imu),
@@ -110,7 +110,7 @@ class Past:
 
 @dataclass(frozen=True)
 class Window:
-    """The moments, the earliest first; gravity (3,) in the world and axes (3, 3) of the gyroscope, which all have in common.
+    """States of the window, earliest first; gravity (3,) in the world and gyroscope axes (3, 3), common to all.
 
     rate_variance : (rad/s)^2 per Hz of the gyroscope; noise : of the device
     """
@@ -124,7 +124,7 @@ class Window:
 
     @classmethod
     def begin(cls, state: NavigationState, instant_ns: int, stamp_ns: int, T_imu_scan: Floats) -> Window:
-        """A window of one moment, of which all is known that the state's covariance says."""
+        """A window of one moment, with the state's covariance as its prior."""
         moment = moment_of(state, instant_ns, stamp_ns, T_imu_scan)
         order = np.concatenate([COMMON, OWN])
         e = state.estimate
@@ -145,7 +145,7 @@ class Window:
     def solve(self, imu: ImuStream) -> tuple[Window, Floats]:
         """The joint estimate by Gauss-Newton, and its information (12 + 15 W, 12 + 15 W), common errors first.
 
-        Where that is not positive definite the estimate stays, and `newest` has no finite covariance.
+        Where that is not positive definite the estimate is unchanged, and `newest` has no finite covariance.
         """
         window, H = self, np.zeros((0, 0))
         for _ in range(MOST_STEPS):
@@ -159,7 +159,7 @@ class Window:
         return window, H
 
     def retract(self, d: Floats) -> Window:
-        """After an error d (12 + 15 W,)."""
+        """The window moved by an error d (12 + 15 W,), common errors (gravity, axes) first."""
         each = d[SHARED:].reshape(-1, EACH)
         return replace(
             self,
@@ -169,7 +169,7 @@ class Window:
         )
 
     def equations(self, imu: ImuStream) -> tuple[Floats, Floats]:
-        """Normal equations H, g of past, scans, increments and the length of gravity."""
+        """Normal equations H, g of the prior, the scans, the IMU increments and the magnitude of gravity."""
         size = SHARED + EACH * len(self.moments)
         H, g = np.zeros((size, size)), np.zeros(size)
         self._add_past(H, g)
@@ -184,6 +184,7 @@ class Window:
         return H, g
 
     def _add_past(self, H: Floats, g: Floats) -> None:
+        """Add the prior (marginalised past), linearised at its own values, to H and g."""
         past = self.past
         x = np.concatenate(
             [self.gravity - past.gravity, (self.axes - past.axes).ravel(), self.moments[0].away(past.moment)]
@@ -192,7 +193,7 @@ class Window:
         g[: len(x)] += past.gradient + past.information @ x
 
     def _add_scan(self, H: Floats, g: Floats, k: int) -> None:
-        """The points of a scan: a quadratic of the LiDAR's pose, carried along the lever to the IMU's."""
+        """Add the normal equations of scan k, transported from the LiDAR's pose to the IMU's."""
         m = self.moments[k]
         if m.equations is None:
             return
@@ -204,7 +205,7 @@ class Window:
         g[own] += J.T @ (e.g + e.H @ off_by(e.T_world_lidar, T))
 
     def _add_increments(self, H: Floats, g: Floats, k: int, imu: ImuStream) -> None:
-        """What the IMU felt between moment k - 1 and moment k, integrated anew with the biases as they are."""
+        """Add the IMU factor between moments k - 1 and k, integrated anew with the present biases."""
         a, b = self.moments[k - 1], self.moments[k]
         rest, J, W = self._increment(a, b, imu)
         begin = SHARED + EACH * (k - 1)
@@ -222,7 +223,7 @@ class Window:
         return self._increment(a, b, imu)[:2]
 
     def _increment(self, a: Moment, b: Moment, imu: ImuStream) -> tuple[Floats, Floats, Floats]:
-        """As `residual`, with its information (15, 15)."""
+        """Residual (15,) of moment b against its prediction from a, its Jacobian, and its information (15, 15)."""
         step = integrate(imu, np.array([a.instant_ns, b.instant_ns]), a.gyro_bias, a.accel_bias, self.axes)
         R = a.T_world_imu[:3, :3]
         R_end, velocities, moved = step.motion(0, R, a.velocity, self.gravity)
@@ -237,9 +238,9 @@ class Window:
         return b.away(led), J, W
 
     def without_first(self, imu: ImuStream) -> Window:
-        """The first moment marginalised: what past, points and increments say of it becomes the past of the next.
+        """Marginalise the first moment: its prior, scan and increments become the prior of the next.
 
-        The direction of gravity walks from one to the next: the world drifts.
+        The prior on the direction of gravity is loosened by a random walk, since the world drifts.
         """
         first, second = self.moments[:2]
         size = SHARED + 2 * EACH
@@ -256,7 +257,7 @@ class Window:
         return replace(self, moments=self.moments[1:], past=past)
 
     def newest(self, H: Floats, like: NavigationState) -> NavigationState:
-        """The newest moment as a state of the filter, its covariance out of the joint information H."""
+        """The newest moment as a filter state with covariance, from the joint information H; `like` supplies the rest."""
         m = self.moments[-1]
         which = np.r_[0:SHARED, len(H) - EACH : len(H)]
         P = np.zeros_like(like.covariance)
@@ -299,7 +300,7 @@ STALE_M = 0.005
 
 
 class WindowMotion(FilterMotion):
-    """Predicts as the filter does, from the newest state; a scan is taken by the joint estimate of the whole window.
+    """Predicts as the filter does, from the newest state; the joint estimate of the whole window replaces its update.
 
     size : moments in the window between two scans
     """
@@ -325,7 +326,7 @@ class WindowMotion(FilterMotion):
         self._equations |= {one.stamp_ns: one for one in equations}
 
     def fuse(self, stamp_ns: int, result: RegistrationResult, prior: MotionPrior) -> RegistrationResult:
-        """The result at the pose and with the covariance that the joint estimate gives it."""
+        """The result with the pose and covariance of the joint estimate; unchanged where that fails."""
         self._joint = self._posterior = None
         if not result.is_accepted or prior.covariance is None or self._next is None or self.window is None:
             return result
@@ -361,7 +362,7 @@ class WindowMotion(FilterMotion):
     def correct(
         self, stamp_ns: int, pose: Floats, prior: MotionPrior | None = None, has_registration: bool = True
     ) -> None:
-        """As of the filter; the window goes on, or begins anew where the filter does."""
+        """Update as the filter; the window is extended, or begins anew where the filter does, and drops its oldest moments."""
         joint, posterior, predicted = self._joint, self._posterior, self._next
         super().correct(stamp_ns, pose, prior, has_registration)
         self._joint, self._equations = None, {}

@@ -43,9 +43,9 @@ def alerts(checks: list[MotionCheck], positions: Floats, stamps_ns: Longs) -> li
 
 
 def _inconsistent(checks: list[MotionCheck]) -> list[Alert]:
-    """Where checks reject the motion of the poses; axes rejected together make one alert.
+    """Alerts where checks reject the motion of the poses; axes rejected together make one alert.
 
-    Inconclusive checks do not part conclusive ones.
+    Inconclusive checks do not separate conclusive ones.
     """
     checks = [check for check in checks if check.is_conclusive]
     if not checks:
@@ -70,7 +70,7 @@ def _noise(apart: Floats) -> Floats:
 
 
 def _stretches(checks: list[MotionCheck], apart: Floats, sigma: Floats, axis: int) -> list[tuple[int, int]]:
-    """Begin and end of where they say so again and again, or one of them by much, along one axis."""
+    """Ranges of checks along one axis whose deviation `apart` (m or rad) is significant in a row, or large in a single check."""
     is_better = np.array([check.agreement > LONE_CHECK_RATIO * check.claimed_agreement for check in checks])
     is_large = is_better & (np.abs(apart) > LARGE[axis] + 2 * OUTLIER_SIGMAS * sigma)
     stretches = []
@@ -84,7 +84,7 @@ def _stretches(checks: list[MotionCheck], apart: Floats, sigma: Floats, axis: in
 
 
 def _alert(run: list[MotionCheck], apart: Floats) -> Alert:
-    """In words, the two axes along which most is missing."""
+    """The alert of a run of checks, with the two axes of largest mean deviation `apart` (6,) in its text."""
     seconds = float(np.median([check.seconds for check in run]))
     worst = sorted(np.argsort(-np.abs(apart) / LEAST_DEVIATION)[:2].tolist())
     motion = " and ".join(
@@ -174,7 +174,7 @@ def _is_rest(motion: Floats) -> bool:
 
 
 def _foreign(checks: list[MotionCheck]) -> list[Alert]:
-    """Where the poses stand and the directions in which the sensor saw something empty: clouds of another frame."""
+    """Alerts where the poses are constant although previously filled viewing directions are empty: clouds in another frame."""
     return [
         Alert(
             checks[begin].first + 1,
@@ -188,7 +188,7 @@ def _foreign(checks: list[MotionCheck]) -> list[Alert]:
 
 
 def _jumps(positions: Floats, stamps_ns: Longs) -> list[Alert]:
-    """Where poses jump as nothing that carries a sensor does."""
+    """Alerts where the positions (N, 3) change their velocity more than any vehicle could, and the stamps are not the cause."""
     steps = np.diff(stamps_ns) * 1e-9
     if len(steps) < 2 or np.any(steps <= 0):
         return []
@@ -207,7 +207,7 @@ def _jumps(positions: Floats, stamps_ns: Longs) -> list[Alert]:
 
 
 def stamp_faults(positions: Floats, stamps_ns: Longs) -> tuple[list[int], float]:
-    """Scans whose stamps alone make the poses jump, by their positions in the run, and by how much a step is wrong, s."""
+    """Scans whose wrong stamps alone make the poses jump, by index in the run, and the largest error of a step, s."""
     steps = np.diff(stamps_ns) * 1e-9
     if len(steps) < 2 or np.any(steps <= 0):
         return [], 0.0

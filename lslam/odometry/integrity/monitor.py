@@ -58,17 +58,17 @@ class ReferenceScan:
 
 
 class IntegrityMonitor(Stateful):
-    """Registers pairs of scans, at a rate and by settings of its own, and keeps these checks of the claimed motions.
+    """Checks the claimed motions by registering pairs of scans, at its own rate and with its own settings.
 
-    Every pair is registered from the claimed motion, and from none where the sensor can have come to rest since the last check.
-    Where the claim is none, fits less than usual, or is a change of motion that no vehicle makes, it is registered from the
-    motion of the last conclusive check as well, and one is searched for some metres around. The motion that explains most
-    points is the one found, and another one that explains as many is its rival.
+    Every pair is registered from the claimed motion, and from standstill where the sensor may have come to rest since the last
+    check. If the claim is standstill, fits less than usual, or is a change of motion that no vehicle makes, it is registered from
+    the last conclusive motion as well, and by a search some metres around. The motion that explains most points is the result;
+    another one that explains as many is its rival.
 
-    Planes that one ring could make by itself are left out (`BREADTH`), so that a sensor's own pattern does not confirm standing
-    still. Some of it remains, so that standing is a rival of any motion along a bare motorway.
+    Planes that one ring alone could make are excluded (`BREADTH`), so that the sensor's own pattern does not confirm standstill.
+    Some of it remains, so that standstill is a rival of any motion along an empty motorway.
 
-    preprocess : tells which points are the vehicle's; the rest of it is not taken
+    preprocess : its minimal range and vehicle box are used, nothing else
     """
 
     STATE = ("checks", "_reference", "_is_broken", "_last_ns", "_motion", "_may_stand", "_stand", "_usual")
@@ -90,9 +90,9 @@ class IntegrityMonitor(Stateful):
         self._usual = UsualAgreement(0.0)
 
     def see(self, position: int, scan: Scan | None, prepared: object, result: ScanResult, sweep: MotionPrior) -> None:
-        """The next scan of the run, None when it could not be read, and its result.
+        """Check the next scan of the run, None when it could not be read.
 
-        prepared : what its method made of it, taken where it fits; sweep : the motion within the scan
+        prepared : the method's prepared points, used if the settings agree; sweep : the motion within the scan
         """
         stamp_ns, is_ok = result.stamp_ns, result.status == "ok"
         step_s = (stamp_ns - self._last_ns) * 1e-9
@@ -113,6 +113,7 @@ class IntegrityMonitor(Stateful):
             trial.see(at, scan, None, ScanResult(k, scan.stamp_ns, np.eye(4)), MotionPrior.at_once(np.eye(4)))
 
     def _is_due(self, position: int, scan: Scan, result: ScanResult, step_s: float) -> bool:
+        """Whether to check this scan: after a break or an inconclusive check, after `LAG_S`, or before overlap gets too small."""
         first = self._reference
         if first is None:
             # The motion within the first scan is not known yet.
@@ -140,6 +141,7 @@ class IntegrityMonitor(Stateful):
     def _view(
         self, position: int, scan: Scan, prepared: object, result: ScanResult, sweep: MotionPrior
     ) -> ReferenceScan:
+        """The scan as reference: its deskewed source points, at most about `PLANE_POINTS` of them, with pose and median range."""
         if not (self._is_prepared and isinstance(prepared, PreparedPoints)):
             prepared = prepare_points(scan.points, self._preprocess, scan.index, scan.times)
         points = thin(prepared, 1 + len(prepared.source) // PLANE_POINTS)

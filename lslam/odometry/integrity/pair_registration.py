@@ -49,7 +49,7 @@ _COLUMNS = 2 * _ROWS
 
 
 def directions(points: Floats) -> Longs:
-    """(N,) numbers of the cells of directions, of about the same size, in which points (N, 3), m, lie as seen from 0."""
+    """(N,) index of the viewing cell, of roughly equal solid angle, of each of the points (N, 3) seen from the origin."""
     ranges = np.maximum(np.linalg.norm(points, axis=1), 1e-9)
     row = np.minimum((np.arcsin(points[:, 2] / ranges) + np.pi / 2) / CELL_RAD, _ROWS - 1).astype(np.int64)
     count = np.maximum(np.round(_COLUMNS * np.cos((row + 0.5) * CELL_RAD - np.pi / 2)), 1)
@@ -92,7 +92,7 @@ STEPS_AT_REST = 4
 class MotionHypothesis:
     """A motion at which a scan fits the planes of an earlier one, and which of its points (S,) lie on them.
 
-    in_view : number of points in directions in which the earlier scan saw something
+    in_view : number of points in directions in which the earlier scan had returns
     """
 
     result: RegistrationResult
@@ -119,7 +119,7 @@ class MotionHypothesis:
         return int(np.count_nonzero(self.on_planes & ~other.on_planes))
 
     def is_same(self, other: MotionHypothesis) -> bool:
-        """Whether both are one motion within their sigma."""
+        """Whether both motions agree within their sigmas; True where a sigma is unknown."""
         if other is self or is_near(self.motion, other.motion):
             return True
         if self.sigma is None or other.sigma is None:
@@ -129,7 +129,7 @@ class MotionHypothesis:
 
 
 class PairRegistration:
-    """The planes of the earlier scan, in voxels of three sizes that follow the scene, and the later scan, laid on them."""
+    """Registers a later scan on the planes of an earlier one, in voxels of three sizes that follow the scale of the scene."""
 
     def __init__(self) -> None:
         # One scan has no fine planes.
@@ -144,7 +144,7 @@ class PairRegistration:
         self._source: Floats = np.zeros((0, 3))
 
     def begin(self, first: Floats, last: PreparedPoints) -> None:
-        """Take the points (N, 3), m, of the earlier scan, and those of the later one."""
+        """Set the points (N, 3), m, of the earlier scan, and those of the later one to register."""
         self._edge = float(np.clip(EDGE_SHARE * median_range(first), SMALLEST_M, LARGEST_M))
         for level, wider in zip(self._planes, (1, *WIDE_FACTORS), strict=True):
             level.clear()

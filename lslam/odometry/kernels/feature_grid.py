@@ -162,11 +162,11 @@ def counterparts(
     grid: tuple[Floats, Rings, Ints, Longs, Ints],
     search: Matches,
 ) -> None:
-    """Fill in the indices of the `count` counterparts of point i at x, y, z, world, -1 from the first on that there is none of.
+    """Fill in the indices of the `count` counterparts of point i at x, y, z, world; -1 from the first missing one on.
 
-    The nearest point; on a surface the next one of its ring; the nearest one of the rings near by. One stays the same while the
+    The nearest point; on a surface the next one of its ring; the nearest one of neighbouring rings. A result is reused while the
     point moves by less than half of the difference between the distances to the second nearest and to the nearest one.
-    reach : size of a cell, and how far a counterpart may lie, m
+    reach : size of a cell, and largest distance of a counterpart, m
     """
     chosen, asked = search
     size, limit = reach

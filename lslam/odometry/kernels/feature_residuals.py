@@ -51,7 +51,7 @@ def _add_point(
     variance: float,
     c2: float,
 ) -> None:
-    """Point to point: all three components of e."""
+    """Add a point-to-point residual e (m) to H and g; r : point relative to the sensor, c2 : squared width of Geman-McClure."""
     d2 = ex * ex + ey * ey + ez * ez
     robust = c2 / (c2 + d2)
     robust *= robust
@@ -80,7 +80,7 @@ def _add_plane(
     variance: float,
     c2: float,
 ) -> float:
-    """Point to plane: e along the unit normal n; returns its weight."""
+    """Add a point-to-plane residual e (m) along the unit normal n to H and g; returns its weight."""
     robust = c2 / (c2 + e * e)
     robust *= robust
     w = robust / variance
@@ -140,8 +140,8 @@ def add_normals(
 ) -> None:
     """Fill in `normals` (N, 3), where they are zero, from the plane voxels of `size`, m, in which points (N, 3) lie.
 
-    thick : m2, variance along the normal above which a voxel holds more than one surface
-    waver : rad2, variance of the normal's direction above which it is not known
+    thick : m2, variance along the normal above which a voxel has more than one surface
+    waver : rad2, variance of the normal's direction above which it is too uncertain
     """
     inverse = 1.0 / size
     for i in range(len(points)):
@@ -157,12 +157,12 @@ def add_normals(
 def linearise_planes(
     points: tuple[Floats], grid: SurfaceGrid, settings: Reach, search: Matches, pose: Pose, width: Width, sums: Sums
 ) -> None:
-    """As `linearise_edges`, for planar points (S, 3). S takes the planes alone whose normal is known well.
+    """Add all planar points (S, 3) to H, S, g and facts, like `linearise_edges`. S takes only planes of well-known normal.
 
-    normals : (N, 3) of the surface around each point of the grid, zero where it is not known. The normal of three points
-        a few decimetres apart has an error of ten degrees and more, and a sum of such normals seems to observe every
-        direction, the one along a corridor included. So the residual is the distance to the plane through the three
-        points, but its Jacobian takes the surface's normal: an instrumental variable, whose error is independent of theirs.
+    normals : (N, 3) of the surface around each point of the grid, zero where unknown. The normal of three points
+     a few decimetres apart has an error of ten degrees and more, and a sum of such normals seems to observe every
+     direction, the one along a corridor included. So the residual is the distance to the plane through the three
+     points, but its Jacobian uses the surface's normal: an instrumental variable, whose error is independent of theirs.
     """
     (source,) = points
     surface, rings, starts, keys, table, normals = grid

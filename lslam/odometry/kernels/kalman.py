@@ -42,6 +42,7 @@ def _eliminate(A: Floats, B: Floats) -> None:
 
 @kernel
 def _product(A: Floats, B: Floats) -> Floats:
+    """Matrix product A B, skipping zeros of A."""
     out = np.zeros((A.shape[0], B.shape[1]))
     for i in range(A.shape[0]):
         for k in range(A.shape[1]):
@@ -275,7 +276,7 @@ def fuse_poses(T: Floats, rest: Floats, C: Floats, P: Floats, age: float) -> tup
     """Weighted mean of the pose T (4, 4) with covariance C (6, 6) and of one with covariance P (6, 6), and its covariance.
 
     Poses on one map share its error, as large as their own, all but one part in `age`. The other pose starts at one of them and
-    has it too, so that no weighing averages it.
+    has it too, so that averaging does not reduce it.
 
     rest : (6,) from the other pose to T; all in world axes, m and rad
     age : factor on P

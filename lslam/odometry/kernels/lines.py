@@ -42,7 +42,10 @@ def line_of(
     line_keys: Longs,
     line_sums: Floats,
 ) -> None:
-    """Bring the row of one slot up to date with the moments of its voxel."""
+    """Recompute the cached line of voxel `slot` if its moments changed: point, unit direction, variance across, tilt variance.
+
+    The last column of `lines` is `NO_LINE` for too few points or points that are not elongated.
+    """
     s = moments[slot]
     key = keys[slot]
     known = s[0] + s[4] + s[7] + s[9]

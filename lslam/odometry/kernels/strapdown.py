@@ -99,7 +99,7 @@ def poses(
     gravity: Floats,
     T_imu_lidar: Floats,
 ) -> Floats:
-    """(K, 4, 4) T_world_lidar of an IMU whose pose T_world_imu (4, 4) and velocity (3,) are those at instant `anchor`.
+    """(K, 4, 4) T_world_lidar of an IMU whose pose T_world_imu (4, 4) and velocity (3,) at instant `anchor` are given.
 
     rotations (K, 3, 3), velocities, positions (K, 3), seconds (K,) : as in `Increments`; gravity : (3,) m/s2, downwards
     """
