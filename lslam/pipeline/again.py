@@ -66,7 +66,7 @@ class ResultComparison:
 
 
 def read_recipe(folder: Path, recording: Path | None = None) -> Recipe:
-    """Read what the run in `folder` was made of; `recording` : where its recording is now.
+    """Read how the run in `folder` was made; `recording` : where its recording is now, None for the same path.
 
     Raises InputError naming what is missing, damaged or no run of a recording.
     """
@@ -126,7 +126,7 @@ def other_programs(recipe: Recipe) -> list[str]:
 
 
 def other_recording(recipe: Recipe, recording: Sequence, truth: Trajectory | None) -> list[str]:
-    """A sentence where the files of the recording are others than at the run, told by sizes and times before all is read."""
+    """A sentence where the recording's files differ from those of the run, by sizes and times, before all is read; or none."""
     if recipe.is_elsewhere:
         return [
             f"the recording is read from {recipe.path}, not from {recipe.manifest['sequence']['path']}: whether its files are "
@@ -139,7 +139,7 @@ def other_recording(recipe: Recipe, recording: Sequence, truth: Trajectory | Non
 
 
 def other_inputs(recipe: Recipe, identity: Mapping[str, str]) -> list[str]:
-    """A sentence for each input beside the recording's files that is another; identity : of the run that was made again."""
+    """A sentence for each differing input besides the recording's files; identity : of the repeated run."""
     # Of `--osm auto` the server is no more; the recording's files are told of before.
     unknown = {"input", "osm"} if recipe.identity.get("osm") == AUTO else {"input"}
     if recipe.is_elsewhere:
@@ -152,7 +152,7 @@ def other_inputs(recipe: Recipe, identity: Mapping[str, str]) -> list[str]:
 
 
 def compare_results(old: Path, new: Path) -> ResultComparison:
-    """Compare the result files of two runs, byte by byte."""
+    """Compare the result files of two runs, byte by byte, in lists of names: same, differing and lacking files."""
     result = ResultComparison()
     for name in OURS:
         files = [folder / name for folder in (old, new)]
@@ -196,6 +196,7 @@ def require_another(run: Path, out: Path) -> None:
 
 
 def _require_same_odometry(run: EarlierRun) -> None:
+    """Raise UsageError where the run's settings now differ from its config.toml in a key that odometry depends on."""
     before = load_config(run.folder / "config.toml", environ={})
     for section in Config.model_fields:
         then, now = getattr(before, section), getattr(run.config, section)
@@ -208,7 +209,7 @@ def _require_same_odometry(run: EarlierRun) -> None:
 
 
 def read_for_graph(folder: Path, settings: list[str]) -> EarlierRun:
-    """As `read_run`, for `pipeline.run` to take as `earlier`.
+    """Read a run like `read_run`, for `pipeline.run` to reuse its odometry as `earlier`.
 
     Raises InputError for a run that kept no odometry, or was located in a map, UsageError for settings of odometry.
     """

@@ -208,7 +208,7 @@ def write_back_end(folder: Path, record: RunRecord, store: KeyframeStore, done: 
 
 
 def describe(georeference: Georeference) -> dict[str, Any]:
-    """Plain values for the manifest, angles in deg, distances in m."""
+    """The georeference as plain values for the manifest, distances in m, rounded; unknown values are omitted."""
     plain = asdict(georeference)
     plain["origin_lat_lon_height"] = [float(v) for v in plain.pop("origin")]
     plain["T_enu_world"] = georeference.T_enu_world.tolist()
@@ -221,10 +221,10 @@ def describe(georeference: Georeference) -> dict[str, Any]:
 
 
 def refine_poses(job: PreparedRun, record: RunRecord, back_end: BackEnd) -> BackEnd:
-    """Refine the poses of `record` where planes of the points that were kept out become thinner; the manifest says by how much.
+    """Refine the poses of `record` by plane adjustment where planes of held-out points get thinner; the manifest has the gain.
 
-    Where fixes, control points or buildings hold the run, its graph says how firmly. Returns the back end with what is left of
-    the control points.
+    Where fixes, control points or buildings constrain the run, its graph gives their prior. Returns the back end with the new
+    residuals of the control points.
     """
     config, manifest, watch = job.config, job.manifest, job.watch
     if not config.graph.refine or manifest.outcome in ("interrupted", "diverged"):
@@ -260,7 +260,7 @@ def refine_poses(job: PreparedRun, record: RunRecord, back_end: BackEnd) -> Back
 
 
 def read_points(job: PreparedRun, results: list[ScanResult], nodes: Longs) -> SweptPoints:
-    """Points of the scans `nodes` (K,) in the world, each between the two poses round the instant it was measured."""
+    """Points of the scans `nodes` (K,) in the world, each between the two poses before and after its instant."""
     config, watch, own = job.config, job.watch, [results[k] for k in nodes]
     prepare = _poser(config, own, max(1, min(OF_A_SCAN, OF_ALL // len(nodes))))
     parts: list[tuple[Floats, Floats]] = []
@@ -300,9 +300,9 @@ def _poser(config: Config, results: list[ScanResult], count: int) -> Callable[[S
 def _adjustment(
     results: list[ScanResult], nodes: Longs, cloud: SweptPoints, prior: PosePrior | None, keyframes: Longs
 ) -> tuple[dict[str, Any], list[ScanResult] | None]:
-    """What the manifest says, and the results with refined poses; None where these are not better.
+    """Facts for the manifest, and the results with refined poses; None instead where the refinement is no improvement.
 
-    keyframes : numbers of the scans of which the `prior` tells
+    keyframes : indices of the scans that the `prior` is about
     """
     before = np.stack([results[k].T_world_lidar for k in nodes])
     is_even = np.floor(cloud.points / CELL_M).astype(np.int64).sum(axis=1) % 2 == 0
@@ -346,7 +346,8 @@ def _adjustment(
 def thinner_windows(gain: Floats, scans: Longs, cells: Longs, count: int) -> Bools:
     """(K,) whether each of `count` scans lies in a window whose planes became significantly thinner.
 
-    gain : (N,) of the logarithm of the thickness about points of `scans` (N,) in `cells` (N, 3), which are one measurement each
+    gain : (N,) change of the logarithm of the thickness about points of `scans` (N,); points in one of the `cells` (N, 3) count
+     as one measurement
     """
     windows = np.minimum(np.arange(count) // WINDOW, max(count // WINDOW - 1, 0))
     is_thinner = np.zeros(int(windows[-1]) + 1, bool)

@@ -141,7 +141,7 @@ def write_changes(folder: Path, result: ChangedCells, new: EarlierRun, old: Earl
     """Write changes.ply, changed and unchanged cells, and changes.geojson, an outline of each object.
 
     The cloud, m, is in the world of the old run; outlines are in longitude and latitude when it is georeferenced, else in
-    metres of that world, which the file says. Raises OutputError.
+    metres of that world, as the file notes. Raises OutputError.
     """
     kinds = [np.full(len(c.cells), 1 if c.kind == "appeared" else -1) for c in result.changes]
     change = np.concatenate([*kinds, np.zeros(len(result.same), np.int64)])

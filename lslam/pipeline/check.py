@@ -35,9 +35,9 @@ ONLY_OF = {
 
 
 def check_config(config: Config) -> None:
-    """Raise UsageError for unknown names and keys without effect, before hours of work.
+    """Raise UsageError for unknown names, contradictions and keys without effect, before a run begins.
 
-    Raises InputError when the map asks for Open3D and it is missing.
+    Raises InputError when the map needs Open3D and it is missing.
     """
     method = config.odometry.method
     require_method(method)
@@ -74,7 +74,7 @@ def check_config(config: Config) -> None:
 
 
 def _check_places(config: Config) -> None:
-    """Raise UsageError for keys of a place on the Earth that have no effect or contradict each other."""
+    """Raise UsageError for keys of georeference or localisation that have no effect or contradict each other."""
     flag = "--crs" if config.gnss.crs or config.gnss.height_crs else "--geoid" if config.gnss.geoid else ""
     if flag and config.gnss.mode == "off" and not (config.osm.extract or config.graph.control):
         raise UsageError(

@@ -61,7 +61,7 @@ def build_finished_map(
 ) -> BuiltMap:
     """The map of `build_map`, coloured if the configuration says so. Raises as `build_map` and `colour_map`.
 
-    problems : takes why no image colours the map, which stays as it is then; None where that raises
+    problems : list for the reason why no image colours the map, which is returned uncoloured then; None raises instead
     """
     if config.map.colour:
         cameras_of(sequence)  # what is wrong with them is said before the work
@@ -94,7 +94,7 @@ def colour_map(
 ) -> tuple[ColouredCloud, ColourCounts]:
     """Colour the map `cloud` by all images that lie between two registered scans.
 
-    Both scans are in the way as well: they have what passes while the image is taken and is in no map, or elsewhere in it.
+    Points of both scans count as occluders too: they contain moving objects that the map lacks or has elsewhere.
     An image that cannot be read is logged, counted and left out. Raises InputError when no image is left, and as `cameras_of`.
     """
     cameras = cameras_of(sequence)
@@ -157,7 +157,7 @@ def _in_order(cameras: list[Camera], motion: ContinuousMotion) -> deque[View]:
 
 
 def motion_of(results: list[ScanResult]) -> ContinuousMotion:
-    """Motion of the LiDAR along the registered scans of the world, in stretches without others between them."""
+    """Continuous motion of the LiDAR along the registered scans of the world, in stretches uninterrupted by others."""
     results = [result.at_stamp for result in results]
     is_registered = np.array([r.status == "ok" and not r.frame for r in results], bool)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], is_registered, [False]]).astype(int)))
@@ -237,7 +237,7 @@ def build_feature_map(
 
 
 def view_features(sequence: Sequence, odometry: FeatureSource, results: list[ScanResult]) -> FeatureView | None:
-    """Features of some of the registered scans, at their final poses; None without any.
+    """Features of up to `MOST_SCANS` registered scans, at their final poses; None without any.
 
     A scan that can no longer be read, or has no features, is left out.
     """

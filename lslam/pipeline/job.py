@@ -82,7 +82,7 @@ class PreparedRun:
 def prepare(
     sequence: Sequence | str | Path, config: Config, truth: Trajectory | None, command: str, watch: Watch
 ) -> PreparedRun:
-    """Find what the configuration asks for beside the scans: fixes, an IMU, poses, a map; and choose the scans."""
+    """Check the configuration, open all inputs that it needs (fixes, IMU, wheels, poses, map), and choose the scans."""
     check_config(config)
     if isinstance(sequence, (str, Path)):
         sequence = open_sequence(sequence)
@@ -122,9 +122,9 @@ def is_open(config: Config, key: str) -> bool:
 
 
 def fit_to_scene(job: PreparedRun, earlier: Config | None = None) -> PreparedRun:
-    """The run with the lengths and the up direction that its first scans show, where its configuration leaves them open.
+    """The run with lengths and up direction adapted to its first scans, where its configuration leaves them open.
 
-    earlier : the configuration of the part of the run that is there, which has them already
+    earlier : configuration of the run to resume, whose values are reused; None without one
     """
     if earlier is None:
         config = with_up(job.sequence, with_scene_scale(job.config, job.sequence))
@@ -139,7 +139,7 @@ def fit_to_scene(job: PreparedRun, earlier: Config | None = None) -> PreparedRun
 
 
 def _with_scene_of(earlier: Config, config: Config) -> Config:
-    """The configuration with the open keys of an earlier one."""
+    """The configuration with its open keys taken from `earlier`."""
     for key in OPEN_KEYS:
         name, _, field = key.partition(".")
         if is_open(config, key):
@@ -149,11 +149,11 @@ def _with_scene_of(earlier: Config, config: Config) -> Config:
 
 
 def choose_scans(sequence: Sequence, odometry: Odometry, config: Config) -> Sequence:
-    """What --start, --count and --skip-frames leave, without points of `preprocess.drop_labels`, with the times of the
-    others, and rings where the method needs them.
+    """The scans of --start, --count and --skip-frames, without points of `preprocess.drop_labels`, with point times, and with
+    rings where the method needs them.
 
-    Raises UsageError when nothing is left, InputError naming --rings when there are no rings to be found, when stated
-    times do not fit, and when labels are needed and there are none.
+    Raises UsageError when no scan is left, InputError naming --rings when rings cannot be determined, when stated
+    times do not fit, and when needed labels are missing.
     """
     labels = config.preprocess.drop_labels
     needs = {
@@ -172,7 +172,7 @@ def choose_scans(sequence: Sequence, odometry: Odometry, config: Config) -> Sequ
 
 
 def announce(job: PreparedRun) -> None:
-    """Say what is about to be run and what the reader decided, once: the log keeps it beside the results."""
+    """Log the run's input and the reader's decisions, add problems and deskewing to the manifest."""
     sequence, config = job.sequence, job.config
     log.info("%s: %d scans of %s, method %s", sequence.name, len(sequence), sequence.path, config.odometry.method)
     for note in sequence.notes:
@@ -215,9 +215,9 @@ def stoppable(job: PreparedRun, message: str) -> Iterator[None]:
 
 
 def bind(odometry: GivenPoses, sequence: Sequence) -> list[str]:
-    """Give the poses the stamps of the whole `sequence` when their file has none, and carry them to the LiDAR.
+    """Give the poses the stamps of the whole `sequence` when their file has none, and convert them to the LiDAR.
 
-    What was decided, one sentence each. Raises InputError when poses and scans do not belong together.
+    Returns the decisions, one sentence each. Raises InputError when poses and scans do not belong together.
     """
     notes: list[str] = []
     trajectory = odometry.trajectory
@@ -244,7 +244,10 @@ def bind(odometry: GivenPoses, sequence: Sequence) -> list[str]:
 
 
 def _of_lidar(trajectory: Trajectory, sequence: Sequence) -> tuple[Trajectory, str]:
-    """The trajectory of the LiDAR, and a note. A file's word for its body counts unless the motion says otherwise."""
+    """The trajectory of the LiDAR, and a note on a conversion. The file's body frame is used unless the motion contradicts it.
+
+    Raises InputError for poses of a camera or IMU without its extrinsic.
+    """
     axis = main_axis(trajectory.poses)
     is_camera = trajectory.frame == "cam0" and axis not in ("+x", "-x")
     T = sequence.calibration.T_cam0_lidar

@@ -56,9 +56,9 @@ INTERRUPTED = "interrupted while the drive was compared with the map"
 
 
 def localise_poses(job: PreparedRun, record: RunRecord) -> None:
-    """Put the poses in the map's frame into `record`, and the result of each scan.
+    """Localise the run in the prior map: poses in the map's frame, and the status of each scan, go to `record`.
 
-    A run that was interrupted, or whose odometry is lost, keeps what it has. Raises RunFailedError when the drive is not found in
+    A run that was interrupted, or whose odometry is lost, is unchanged. Raises RunFailedError when the drive is not found in
     the map.
     """
     config, manifest = job.config, job.manifest
@@ -194,7 +194,7 @@ def _find_start(sequence: Sequence, prior_map: PriorMap, search: PlaceFinder, co
 
 
 def _prior_of(sequence: Sequence, prior_map: PriorMap, config: Config) -> tuple[StartPrior | None, str]:
-    """Prior knowledge of the start, in level axes of the map, and in words."""
+    """Prior of the start in level axes of the map, by configuration or satellite fix, or None; and the region in words."""
     section = config.localize
     into_level = se3.inverse(prior_map.T_map_level)
     if section.start is not None:
@@ -218,7 +218,7 @@ def _prior_of(sequence: Sequence, prior_map: PriorMap, config: Config) -> tuple[
 def _at_first_scan(
     start: Start, store: KeyframeStore, results: list[ScanResult], config: Config
 ) -> tuple[Floats, Floats]:
-    """Pose (4, 4) of the first scan, level axes, and its covariance, from the found keyframe by odometry."""
+    """Pose (4, 4) of the first scan, level axes, and its covariance, transported by odometry from the located keyframe."""
     keyframe = store.keyframes[start.vote.keyframe]
     T = start.vote.T_level_odometry @ results[0].T_world_lidar
     at = start.vote.T_level_odometry @ keyframe.T_world_lidar
@@ -233,7 +233,7 @@ def _at_first_scan(
 
 
 def _deliver(record: RunRecord, prior_map: PriorMap, fixes: list[MapFix], config: Config) -> None:
-    """Trajectory in the map's frame. Registered scans keep their poses; odometry is bent to pass between them."""
+    """Put the trajectory in the map's frame into the record. Registered scans keep their poses; odometry is bent between them."""
     T = prior_map.T_map_level
     results = record.results[: len(fixes)]
     into_map = [
@@ -259,7 +259,7 @@ def _deliver(record: RunRecord, prior_map: PriorMap, fixes: list[MapFix], config
 
 
 def _tell(record: RunRecord, prior_map: PriorMap, start: dict[str, Any], config: Config, manifest: Manifest) -> None:
-    """Write the results of the scans into manifest and problems."""
+    """Write counts and problems of the scans' registration on the map into the manifest."""
     fixes = record.map_fixes
     counts = Counter[str](fix.status for fix in fixes)
     doubtful = sum(fix.is_doubtful for fix in fixes)
@@ -286,9 +286,9 @@ def _tell(record: RunRecord, prior_map: PriorMap, start: dict[str, Any], config:
 
 
 def view_prior_map(job: PreparedRun, record: RunRecord, prior_map: PriorMap) -> None:
-    """Put the map near the drive into the record, with the column `change`: -1 gone, 0 as it was, 1 not in the map.
+    """Put the map about the drive into the record, with the column `change`: -1 gone, 0 unchanged, 1 not in the map.
 
-    Only scans that the map holds tell what differs, about one a metre. Raises InterruptedRunError when the run is to stop.
+    Only scans registered on the map are used, about one a metre. Raises InterruptedRunError when the run is to stop.
     """
     section, results = job.config.map, record.results
     positions = se3.apply(se3.inverse(prior_map.T_map_level), record.trajectory.positions)
@@ -325,7 +325,7 @@ def spread_out(way: Floats) -> Bools:
 
 
 def _observe(job: PreparedRun, results: list[ScanResult]) -> Evidence:
-    """Cells that the registered scans of the drive hit or pass; a stopped run goes on from its checkpoint."""
+    """Cells that the registered scans of the drive hit or pass; a resumed run continues from its checkpoint."""
     section, watch, poses = job.config.map, job.watch, np.stack([r.T_world_lidar for r in results])
     assert job.folder is not None
     folder = job.folder

@@ -38,27 +38,27 @@ LIBRARIES = ("numpy", "numba", "llvmlite", "scipy", "gtsam", "kiss-icp", "shapel
 
 
 class Manifest:
-    """Facts collected during a run; `as_dict` is the file at any moment.
+    """Facts collected during a run; `as_dict` gives the content of the file at any moment.
 
     outcome : done, degraded (a scan was bridged or skipped, or input was dropped, replaced or refused), diverged or
         interrupted
-    reading : what else than its path the sequence was opened with: topics, extrinsics
+    reading : options besides its path that the sequence was opened with: topics, extrinsics
     truth_file : of ground truth that replaces the recording's own
-    unscored : why a known ground truth gave no score, empty where it did
+    unscored : reason why existing ground truth gave no score, else empty
     deskew : treatment of the motion within a scan, `describe_deskew`
     pose_time : where in a sweep the stamps of scans lie, to which poses belong: scan_start, scan_middle or scan_end
     world : where the coordinates begin and whether z is up
-    imu, wheels : use of them, empty without `--imu` and `--wheels`; keyframes : how many and how large
-    graph, georeference : what the back end did and where on the Earth the world lies, empty where it did nothing
-    refinement : how much thinner planes became by it, empty where none was asked for
-    localization : how the drive was found in a map that exists and how many scans that holds, empty without one
-    identity : digests that a run and its resumption share; resumed_after_scans : that were done when it was resumed
-    posed_by : scans by who posed them: the method, what stood in for it, the motion prior
+    imu, wheels : their use, empty without `--imu` and `--wheels`; keyframes : their number and size
+    graph, georeference : results of the back end and position on the Earth, empty without
+    refinement : reduction of the planes' thickness, empty without refinement
+    localization : how the drive was found in a prior map and how many scans were registered on it, empty without one
+    identity : digests that a run and its resumption share; resumed_after_scans : number of scans at each resumption
+    posed_by : number of scans by source of their pose: the method, a fallback, the motion prior
     segments : of a run that lost its map on the way, each with its connection to the others
-    integrity : how many pairs of scans checked the motion beside the method, how many were conclusive, and the alerts raised
-    problems : what went wrong in this run, beside what was wrong with the recording before; warnings : what its log warns of,
-        which stands behind them in the file and does not decide how the run ended
-    last : what the file says of a run that is over
+    integrity : numbers of pairs of scans that checked the motion independently, of conclusive ones, and of alerts
+    problems : faults of this run, in addition to those of the recording; warnings : those of its log, listed after them, without
+        effect on the outcome
+    last : final content of the file
     """
 
     def __init__(self, command: str, sequence: Sequence, config: Config) -> None:
@@ -225,7 +225,7 @@ def machine_facts() -> dict[str, str | None]:
 def describe_deskew(sequence: Sequence, config: Config, has_times: bool, how: str) -> tuple[str, bool]:
     """Treatment of the motion within a scan, in words, and whether distortion remains.
 
-    has_times : whether the scans have per-point times; how : in words, how the method deskews, empty when it does not
+    has_times : whether the scans have per-point times; how : how the method deskews, in words, empty when it does not
     """
     if sequence.motion_compensated:
         return "none needed: the scans are motion compensated", False
@@ -238,7 +238,7 @@ def describe_deskew(sequence: Sequence, config: Config, has_times: bool, how: st
 
 
 def peak_memory_mb() -> float | None:
-    """Largest resident memory of this process so far, MB; None where the system does not say."""
+    """Largest resident memory of this process so far, MB; None where the system does not report it."""
     # Linux's rusage begins with what the process had that started this one.
     with suppress(OSError, ValueError):
         lines = Path("/proc/self/status").read_text().splitlines()

@@ -70,7 +70,7 @@ def note_with(path: Path, about: Note) -> Note:
 
 
 def drop_note(path: Path) -> None:
-    """Remove a map from the note before another takes its name. Raises OutputError."""
+    """Remove the entry of map `path` from the note, so that none describes it while it is replaced. Raises OutputError."""
     notes, target = _notes(path), path.with_suffix(".json")
     if notes.pop(path.name, None) is None:
         return
@@ -161,7 +161,7 @@ def write_run_map(
     world: str,
     georeference: Georeference | None,
 ) -> None:
-    """Write the map of a run, and if configured a surface, the occupancy, and the trajectory on the Earth.
+    """Write the map of a run and, if configured, a surface mesh, the occupancy, and the trajectory as GeoJSON.
 
     Raises as `write_map`.
     """
@@ -191,7 +191,7 @@ def projection_of(georeference: Georeference | None, suffix: str) -> Projection 
 def write_map(path: Path, cloud: Cloud, note: MapNote, georeference: Georeference | None = None) -> None:
     """Write the cloud, world frame, m, in the format of the suffix, and its note `<stem>.json` beside it.
 
-    Coordinates are those of `projection_of`; the note says how to go on. Raises as `write_cloud` and `projection_of`.
+    Coordinates are those of `projection_of`; the note has the transform. Raises as `write_cloud` and `projection_of`.
     """
     projection = projection_of(georeference, path.suffix)
     if projection is None:
@@ -212,7 +212,7 @@ def write_map(path: Path, cloud: Cloud, note: MapNote, georeference: Georeferenc
 
 
 def write_geojson(path: Path, trajectory: Trajectory, georeference: Georeference, sequence: str) -> None:
-    """Write the trajectory as a line on the Earth."""
+    """Write the trajectory as a GeoJSON line, lon, lat (deg), height (m)."""
     about = {
         "sequence": sequence,
         "lslam": __version__,

@@ -65,8 +65,7 @@ def build_map(
     """Merge every registered scan.
 
     Bridged scans, and scans of another frame, are left out: their error would enter the map. A map too large for memory is
-    kept in a temporary folder in `spool`. Raises InterruptedRunError when `watch` says so; `checkpoints` then allow to
-    continue.
+    kept in a temporary folder in `spool`. Raises InterruptedRunError when `watch` says so; `checkpoints` then allow resuming.
     """
     section = config.map
     poses = np.stack([r.T_world_lidar for r in results])
@@ -96,7 +95,8 @@ def scans_again(
     """Second pass over raw scans: their numbers, and the results of `prepare`, which runs ahead in a thread.
 
     message : of the InterruptedRunError that is raised when `watch` says so
-    count : scans that an earlier pass has done; offer : is called with each further number, and whether it is the last
+    count : number of scans that an earlier pass has processed; offer : called with each further number, and whether it is the
+        last
     """
     for _ in range(count):
         watch.on_step()
@@ -151,7 +151,7 @@ def scan_poser(results: list[ScanResult], config: Config) -> Callable[[Scan], Po
 
 
 class MapMaker:
-    """Processing of scans into a map: cleaning, merging, occupancy.
+    """Makes a map out of scans: cleaning, merging, occupancy.
 
     section : configuration; spool : folder for maps too large for memory; keep : folder for a map that can be resumed
     up : (3,) unit vector, up in the world of the scans
@@ -186,7 +186,7 @@ class MapMaker:
         self._merge([scan] if self._cleaner is None else self._cleaner.add(scan))
 
     def finish(self) -> BuiltMap:
-        """Map of all added scans."""
+        """The map of all added scans, with its image from above, a sample, and the processing steps in words."""
         if self._cleaner is not None:
             self._merge(self._cleaner.finish())
             log.info("map: %d of %d points moved and are left out", self._cleaner.removed, self._cleaner.seen)
@@ -246,7 +246,7 @@ def course_of(results: list[ScanResult]) -> Course:
 
 
 def motion_within(scan: Scan, course: Course) -> MotionPrior:
-    """Motion of the sensor during a sweep, from the final poses of the scans round it; one pose if they do not tell."""
+    """Motion of the sensor during a sweep, by the final poses of surrounding scans; one pose if there are fewer than two."""
     times = knots_over(scan.span)
     if len(times) < 2 or len(course.instants_ns) < 2:
         return MotionPrior.at_once(np.eye(4))
@@ -332,9 +332,9 @@ def needs_labels(section: MapConfig) -> bool:
 
 
 def with_attributes(sequence: Sequence, config: Config) -> Sequence:
-    """Sequence with rings, where the map wants them and the points have none; points without a ring stay.
+    """The sequence with rings, where the map stores them and the points have none; points without a ring remain.
 
-    Raises InputError where no rings can be found.
+    Raises InputError where rings cannot be determined.
     """
     if "ring" not in config.map.attributes:
         return sequence
@@ -348,7 +348,7 @@ def with_attributes(sequence: Sequence, config: Config) -> Sequence:
 
 
 def attribute_notes(section: MapConfig, first_ns: int) -> dict[str, str]:
-    """Meaning of each attribute, for people, by its name; first_ns : earliest stamp of the recording."""
+    """Meaning of each attribute, in words, by its name; first_ns : earliest stamp of the recording."""
     clock = "Unix time in PLY and PCD, adjusted standard GPS time (less 1e9 s) in LAS and LAZ"
     if "time" in section.attributes and not is_unix_time(first_ns):
         clock = "the recording's own seconds, which are no Unix time; LAS and LAZ mark them as GPS week time"

@@ -93,7 +93,7 @@ def write_tiles(
 
     Tiles in LAZ are COPC, `.copc.laz`; of a georeferenced run `tiles.vpc` makes them one layer of QGIS.
 
-    Tile X, Y holds X * size <= x < (X + 1) * size, m, in the coordinates of `projection_of`. Raises OutputError, and
+    Tile X, Y contains X * size <= x < (X + 1) * size, m, in the coordinates of `projection_of`. Raises OutputError, and
     UsageError for coordinates that no map can be written in.
     """
     projection = projection_of(georeference, f".{suffix}")
@@ -138,7 +138,7 @@ def _publish(stage: Path, folder: Path, names: set[str]) -> None:
 
 
 def _sorted_into(cloud: Cloud, size: float, spool: Path) -> Iterator[tuple[tuple[int, int], ArrayCloud]]:
-    """Points of each tile, tiles in order."""
+    """Key (X, Y) and points of each tile, in order of keys; the points are sorted through files in `spool`."""
     record = np.dtype(
         [("points", np.float64, (3,)), ("intensity", np.float32), ("columns", list(cloud.column_types.items()))]
     )
@@ -168,7 +168,7 @@ def _sorted_into(cloud: Cloud, size: float, spool: Path) -> Iterator[tuple[tuple
 
 
 def _spill(waiting: dict[tuple[int, int], list[NDArray[Any]]], spool: Path) -> set[tuple[int, int]]:
-    """Append the buffered points to the files of their tiles."""
+    """Append the buffered points to the files of their tiles, empty the buffer, and return its keys."""
     for key, parts in waiting.items():
         with ExitStack() as stack:
             stream = stack.enter_context(_part(spool, key).open("ab"))
@@ -237,9 +237,9 @@ def _schema(name: str, kind: np.dtype[Any]) -> Mapping[str, Any]:
 
 
 def read_prior_map(target: Path, config: RegistrationConfig) -> PriorMap:
-    """Read the map, in coordinates near it: those of the run, or of the file less whole kilometres.
+    """Read the map `target` in the run's coordinates, or those of its file, minus whole kilometres where they are large.
 
-    Raises InputError naming what is missing or broken.
+    Raises InputError naming what is missing or damaged.
     """
     stored = map_of(target)
     points, origin = stored.read().points, np.zeros(3)

@@ -221,6 +221,7 @@ def _solve(
     left_out: list[LeftOut],
     should_stop: Stop,
 ) -> Merge:
+    """Optimise the graph of the chain and correct all scans by it. Raises RunFailedError where it has no solution."""
     keyframes = chain.keyframes()
     loops = [c.constraint for c in candidates if c.is_accepted and c.constraint is not None]
     graph = PoseGraph(

@@ -73,7 +73,7 @@ def merge_into(
 ) -> dict[str, Any]:
     """Merge runs into the folder `out`. Returns its manifest.
 
-    Raises as `merge_runs`, OutputExistsError and OutputError as `RunFolder`, UsageError for a map that shall be coloured.
+    Raises as `merge_runs`, OutputExistsError and OutputError as `RunFolder`, UsageError for `map.colour`.
     """
     if config.map.colour:
         raise UsageError("map.colour: merged maps have no colours; those of their runs have, by lslam map RUN --colour")
@@ -150,7 +150,7 @@ def _fill(folder: RunFolder, merge: Merge, config: Config, watch: Watch) -> dict
 
 
 def _recording(run: EarlierRun, config: Config, problems: list[str]) -> Recording | None:
-    """Raw scans of a run with what the map needs; None, with a problem, where they are missing."""
+    """Raw scans of a run with the attributes that the map stores; None, with a problem, where they are missing."""
     try:
         scans = open_scans(replace(run, config=run.config.model_copy(update={"map": config.map})))
         return with_attributes(scans, config) if config.map.write else scans
@@ -163,6 +163,7 @@ def _recording(run: EarlierRun, config: Config, problems: list[str]) -> Recordin
 def _rows(
     merge: Merge, recordings: Sequence[Recording | None], trajectories: Sequence[Trajectory], config: Config
 ) -> list[SessionRow]:
+    """One row per session for the manifest and the page: counts, votes, loops with others, ATE, and its transform."""
     rows = []
     for n, (run, session, recording, trajectory) in enumerate(
         zip(merge.runs, merge.sessions, recordings, trajectories, strict=True)
@@ -249,6 +250,7 @@ def _map(
 
 
 def _views(merge: Merge, trajectories: Sequence[Trajectory]) -> list[SessionView]:
+    """Positions of each session before and after the graph, in the common world, for the page."""
     return [
         SessionView(
             session.name,

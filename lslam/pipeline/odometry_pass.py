@@ -57,7 +57,7 @@ _ready: set[tuple[object, ...]] = set()
 
 
 def estimate_poses(job: PreparedRun) -> RunRecord:
-    """Odometry over all scans, judged; its keyframes go to the store, and the checkpoints say where an earlier run left off.
+    """Estimate odometry over all scans; keyframes go to the store, and an earlier run is continued from its checkpoint.
 
     Raises InputError when no scan can be used.
     """
@@ -137,7 +137,7 @@ def estimate_poses(job: PreparedRun) -> RunRecord:
 
 
 def _begin_segment(job: PreparedRun, inertial: Inertial) -> Begin | None:
-    """Trackers with an empty map; None for a method that predicts by itself, or whose poses are given."""
+    """Function of a pose that makes a tracker with an empty map; None for a method that predicts by itself or takes poses."""
     config = job.config
     if not isinstance(job.odometry, Deskewing):
         return None
@@ -159,7 +159,7 @@ def _stationary(config: Config) -> StationaryDetector | None:
 
 
 def _chain(inertial: Inertial, store: KeyframeStore, config: Config) -> InertialChain | None:
-    """The IMU between keyframes, when the graph is to have it."""
+    """IMU factors between keyframes, if the graph is to contain them."""
     motion = inertial.motion
     if not isinstance(motion, SmootherMotion) or motion.refusal or not config.lio_sam.graph_imu:
         return None
@@ -169,7 +169,7 @@ def _chain(inertial: Inertial, store: KeyframeStore, config: Config) -> Inertial
 
 
 def _turns(inertial: Inertial, store: KeyframeStore, config: Config) -> list[Turn]:
-    """The gyroscope's turns from each keyframe to the next, when the graph is to have them."""
+    """The gyroscope's rotations between successive keyframes, if the graph is to contain them."""
     if inertial.motion is None or not config.graph.imu_orientation:
         return []
     sigma = float(np.deg2rad(config.graph.imu_orientation_deg))
@@ -182,7 +182,7 @@ def _turns(inertial: Inertial, store: KeyframeStore, config: Config) -> list[Tur
 
 
 def odometry_checkpoints(folder: RunFolder, job: PreparedRun, goes_on: bool) -> OdometryCheckpoints | None:
-    """Checkpoints in a run folder; None when they are not wanted. Says so when an earlier run left none to go on from."""
+    """Checkpoints in a run folder; None when they are disabled. Logs when the run to resume left none."""
     every_s = job.config.odometry.checkpoint_s
     if every_s == 0:
         return None
@@ -195,9 +195,9 @@ def odometry_checkpoints(folder: RunFolder, job: PreparedRun, goes_on: bool) -> 
 
 
 def _warm_up(job: PreparedRun, stationary: StationaryDetector | None, monitor: IntegrityMonitor | None) -> None:
-    """Compile or load what the scans would otherwise wait for, less of it when odometry is over.
+    """Compile or load the kernels of the run, fewer when its odometry is done already.
 
-    What this process has loaded stays: a worker of a study does it once for all its runs alike.
+    A process loads the kernels of one configuration once, for all its runs.
     """
     config, is_over = job.config, job.checkpoints is not None and job.checkpoints.is_over
     alike = type(job.odometry), bool(config.osm.extract), repr(config.model_dump(exclude=_WITHOUT_KERNELS))
@@ -211,7 +211,7 @@ def _warm_up(job: PreparedRun, stationary: StationaryDetector | None, monitor: I
 
 
 def _begin_imu(job: PreparedRun) -> Inertial:
-    """The IMU's part, empty without one; as an earlier run found it, when that left off on the way."""
+    """The initialised IMU, empty without one; a resumed run reads the result of the earlier one."""
     config = job.config
     if not config.imu.use:
         return Inertial(None)
@@ -228,7 +228,7 @@ def _begin_imu(job: PreparedRun) -> Inertial:
 
 
 def _report_faults(results: list[ScanResult], manifest: Manifest) -> None:
-    """Name the scans of which a part was wrong and the rest was used."""
+    """Add a problem naming the scans of which faulty points were dropped."""
     faulty = [r for r in results if r.fault]
     if not faulty:
         return

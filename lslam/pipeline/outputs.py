@@ -45,7 +45,7 @@ MATCH_COLUMNS = "keyframe,scan,building,verdict,kind,rank,walls,fitness,coverage
 
 
 def write_loops(path: Path, candidates: Sequence[LoopCandidate], scans: Sequence[int]) -> None:
-    """One row per candidate in their order; `sigma` is the standard deviation where it is largest, empty when unknown.
+    """Write loops.csv, one row per candidate in their order; sigmas are the largest standard deviations, empty when unknown.
 
     scans : of the keyframes, as the recording numbers them. Raises OutputError when the file cannot be written.
     """
@@ -98,6 +98,7 @@ def write_osm_matches(path: Path, matches: OsmMatches, scans: Sequence[int], pos
 def _match_row(
     match: KeyframeMatch | BuildingMatch, scans: Sequence[int], building: str, pose: Floats
 ) -> tuple[Any, ...]:
+    """Row of osm_matches.csv for a keyframe match or a building match; the pose (3,) is in m and deg."""
     place = (pose[0], pose[1], np.degrees(pose[2])) if match.rank else (np.nan, np.nan, np.nan)
     return (
         match.keyframe,
@@ -129,7 +130,7 @@ def timing_text(
     """Table of times of scans by number and stamp, with seconds (N, S) of the stages `names`.
 
     back_end : seconds by row and name, of stages that do not count in the total of a scan
-    saved_s : seconds by row that were not needed, a column when there are any; empty where nobody knows
+    saved_s : seconds by row that the IMU saved, a column when there are any; empty where unknown
     """
     back_end = back_end or {}
     later = list(dict.fromkeys(f"{AFTER}{name}" for row in back_end.values() for name in row))
@@ -212,7 +213,7 @@ def write_scans(folder: RunFolder, record: RunRecord) -> None:
 
     With an IMU also imu_states.csv, its estimated state after each scan.
 
-    `saved_s` of timing.csv is what the IMU saved where a scan was registered from constant velocity too, empty elsewhere.
+    `saved_s` of timing.csv is the time the IMU saved where a scan was registered from constant velocity too, empty elsewhere.
     """
     names, seconds = stage_matrix(record.results)
     indices, stamps = [r.index for r in record.results], [r.stamp_ns for r in record.results]
@@ -286,7 +287,7 @@ def write_localization(folder: RunFolder, record: RunRecord) -> None:
 
 
 def write_map(folder: RunFolder, built: BuiltMap, config: MapConfig, record: RunRecord) -> None:
-    """Write map.ply, .pcd, .las or .laz with map.json beside, in map coordinates if the run is georeferenced."""
+    """Write map.<format> with map.json, in map coordinates if the run is georeferenced; raises OutputError for a full disk."""
     points = len(built.cloud) + (0 if built.occupancy is None else len(built.occupancy))
     columns = sum(kind.itemsize for kind in built.cloud.column_types.values())
     size = BYTES_PER_POINT * points + columns * len(built.cloud) + BYTES_PER_SAMPLE_POINT * len(built.sample)

@@ -34,10 +34,10 @@ def gather_figure(
     truth_of: Callable[[Sequence], Trajectory | None] = lambda sequence: None,
     **reading: Any,
 ) -> PlottedRun:
-    """Parts of the run that the figure `what` needs.
+    """Read the parts of the run that the figure `what` needs.
 
-    sequence : where the raw scans have moved; truth_of : gives what replaces the recording's truth, None for nothing
-    reading : as `open_sequence`
+    sequence : where the raw scans are if they have moved; truth_of : returns the truth to use instead of the recording's, or None
+    reading : options of `open_sequence`
 
     Raises InputError naming what is missing, UsageError for an unknown figure.
     """
@@ -68,7 +68,7 @@ def gather_figure(
 def write_figure(run: PlottedRun, what: str, path: Path, width: float, font: float) -> None:
     """Draw a figure into `path`, .png, .svg or .pdf, atomically; width : mm; font : points.
 
-    Raises UsageError for another suffix or a size that no page has, OutputError when it cannot be written.
+    Raises UsageError for another suffix or an impossible size, OutputError when it cannot be written.
     """
     check_plot_path(path)
     if not 20 <= width <= 2000 or not 3 <= font <= 72:

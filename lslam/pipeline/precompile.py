@@ -51,6 +51,7 @@ def warm_up(*modules: str) -> Callable[[Config], None]:
 
 
 def _last_of_method(config: Config) -> None:
+    """Compile the kernels that a method needs last: optimiser, its target, ground."""
     from lslam.odometry import create_odometry
     from lslam.registration import optimiser
     from lslam.registration.preprocessing import ground
@@ -109,7 +110,7 @@ _helpers: list[subprocess.Popen[bytes]] = []
 
 
 def start_helper(config: Config, *, if_cold: bool = False) -> None:
-    """Start the second process, once; if_cold : only where no kernel is compiled yet.
+    """Start the second process, which compiles kernels, once; if_cold : only where no kernel is compiled yet.
 
     Without a second core, or a shared cache, nothing starts.
     """

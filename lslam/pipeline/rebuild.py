@@ -112,9 +112,9 @@ class RebuiltMap:
 
 
 def read_run(folder: Path, settings: Iterable[str] = ()) -> EarlierRun:
-    """Read a run folder; `settings` ("map.voxel=0.1") beat its configuration.
+    """Read a run folder; `settings` ("map.voxel=0.1") override its configuration.
 
-    Raises InputError naming the file that is missing or broken, ConfigError for settings that make no sense.
+    Raises InputError naming the file that is missing or damaged, ConfigError for invalid settings.
     """
     require_run(folder)
     try:
@@ -150,11 +150,11 @@ def recording_of(run: EarlierRun, sequence: Path | None = None, flag: str = "--s
 
 
 def open_scans(run: EarlierRun, sequence: Path | None = None, *, flag: str = "--sequence", **reading: Any) -> Sequence:
-    """Scans of the run; `sequence` names them if they have moved.
+    """Open the scans of the run; `sequence` is their path if they have moved.
 
-    flag : what to say where they are with; reading : goes to `open_sequence`, over the topics that the run was told
+    flag : option to suggest for that in messages; reading : for `open_sequence`, overriding the topics of the run
 
-    Raises InputError naming the path when the raw scans are gone, or are others than those of the run.
+    Raises InputError naming the path when the raw scans are missing, or differ from those of the run.
     """
     path = recording_of(run, sequence, flag)
     section = run.config.input
@@ -176,7 +176,7 @@ def open_scans(run: EarlierRun, sequence: Path | None = None, *, flag: str = "--
 
 
 def _with_clock(run: EarlierRun, recording: Sequence) -> Sequence:
-    """Recording with the rule for its points' times as the run decided."""
+    """The recording with the clock of its points that the run chose; raises InputError for a damaged manifest."""
     facts = run.manifest.get("sequence", {}).get("point_times")
     if facts is None:
         return recording
@@ -204,11 +204,11 @@ def rebuild(
 ) -> RebuiltMap:
     """Build the map with the run's configuration and write it to `out`, by default map.<format> in the run folder.
 
-    Maps of other names and formats stay. Where it is a map of the run folder, what the run says of its map is renewed: the
-    figures in evaluation.json, report.html and manifest.json. All is written elsewhere first and then renamed, so that
-    nothing changes before everything is whole.
+    Maps of other names and formats remain. For a map of the run folder itself, its figures in evaluation.json, report.html and
+    manifest.json are updated. All files are written elsewhere first and then renamed, so that nothing changes before everything
+    is complete.
 
-    Raises OutputExistsError when the file is there, or a run is at work in the folder, OutputError when it cannot be written,
+    Raises OutputExistsError when the file exists, or a run is active in the folder, OutputError when it cannot be written,
     UsageError for a `crs` without a georeference or that no map can be written in, InterruptedRunError when `watch`
     says so.
     """
@@ -247,7 +247,7 @@ def check_output(path: Path, overwrite: bool) -> None:
 
 
 def place_of(run: EarlierRun, crs: OutputCrs | None) -> Georeference | None:
-    """Georeference of the run, in the requested coordinates."""
+    """Georeference of the run, in the CRS `crs` if that is given; raises UsageError for a CRS without a georeference."""
     georeference = run.georeference
     if crs is None:
         return georeference
@@ -290,7 +290,7 @@ def _stage(folder: Path) -> Iterator[Path]:
 
 
 def _publish(stage: Path, path: Path) -> None:
-    """Rename all files in `stage` to beside `path`; at no instant does a note describe another map than the one on disk."""
+    """Rename all files in `stage` to the folder of `path`; the note never describes another map than the one on disk."""
     note = stage / path.with_suffix(".json").name
     write_json(note, note_with(path, note_of(stage / path.name)))
     drop_note(path)
@@ -324,7 +324,10 @@ def covariances_of(run: EarlierRun) -> Floats | None:
 
 
 def _statuses(path: Path, count: int) -> tuple[Status, ...]:
-    """Status of each scan; without a table all count as registered, those of another frame as bridged."""
+    """Status of each scan, by scans.csv; all `ok` without that file. Scans of another frame count as bridged.
+
+    Raises InputError for a damaged table.
+    """
     known: dict[str, Status] = {"ok": "ok", "bridged": "bridged", "skipped": "skipped"}
     try:
         with path.open(newline="", encoding="utf-8", errors="replace") as stream:
@@ -345,10 +348,10 @@ def _statuses(path: Path, count: int) -> tuple[Status, ...]:
 
 
 def renew_files(target: Path, folder: Path, record: RunRecord) -> None:
-    """Write into `target` the files of the run folder `folder`, with the parts about its map renewed.
+    """Write into `target` the files of the run folder `folder`, with the parts about its map updated.
 
-    record : of the new map, what is drawn with it, and the manifest as it shall be. A report that the run did not write is
-        not made; what cannot be read is left alone, which is said. Raises OutputError.
+    record : of the new map, for the drawings, and the new manifest. A report that the run did not write is
+     not made; unreadable files are left unchanged, with a warning. Raises OutputError.
     """
     before, new = read_json(folder / EVALUATION), run_document(record, None) or {}
     if before or not (folder / EVALUATION).exists():

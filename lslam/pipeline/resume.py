@@ -47,7 +47,7 @@ INPUTS = {
 
 
 def input_digest(sequence: Sequence, truth: Trajectory | None) -> str:
-    """Digest of a recording without reading its scans: path, number of scans, size and time of every file, the truth's poses.
+    """Digest of a recording by its path, number of scans, sizes and times of its files, and the truth's poses; no scan is read.
 
     Raises InputError when the folder cannot be listed.
     """
@@ -71,6 +71,7 @@ def listing_digest(path: Path) -> str:
 
 
 def _listing(path: Path, scans: int) -> hashlib._Hash:
+    """SHA-256 of path, number of scans, and names, sizes and times of all files; raises InputError when not listable."""
     digest = hashlib.sha256(f"{path}\0{scans}\0".encode(errors="surrogateescape"))
     try:
         for name, stat in _files(path):
@@ -163,6 +164,7 @@ def _content(*paths: str) -> str:
 
 
 def _digest(values: Iterable[Any]) -> str:
+    """SHA-256, hexadecimal, of the arrays' types and bytes; None counts, too."""
     digest = hashlib.sha256()
     for value in values:
         array = None if value is None else np.ascontiguousarray(value)
@@ -177,8 +179,8 @@ def may_go_on(folder: Path, identity: dict[str, str], config: Config) -> bool:
 
     Raises
     ------
-    RunFinishedError : the run is finished. RunFailedError, GateError : likewise, and it ended so
-    OutputExistsError : what was begun is another run, or does not say what it is
+    RunFinishedError : the run is finished. RunFailedError, GateError : it diverged, or is degraded and `input.strict`
+    OutputExistsError : the folder has another run, or a damaged one
     """
     if not (folder / MANIFEST).is_file():
         return False
@@ -217,7 +219,7 @@ def _difference(
 
 
 def _raise_outcome(folder: Path, status: str, manifest: dict[str, Any], config: Config) -> None:
-    """Raise the outcome of a finished run."""
+    """Raise the error for a finished run: RunFailedError, GateError or RunFinishedError; nothing for an unfinished one."""
     problems = manifest.get("problems")
     why = "; ".join(map(str, problems)) if isinstance(problems, list) else ""
     state = f"the run in {folder} is finished"

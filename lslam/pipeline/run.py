@@ -46,20 +46,20 @@ def run(
 
     Parameters
     ----------
-    sequence : an open sequence, or what `open_sequence` takes
+    sequence : an open sequence, or an argument of `open_sequence`
     config : the method and every other key: `load_config(settings=["odometry.method=gicp", "map.voxel=0.1"])`
     out : the run folder, a URL for one in storage; None writes nothing and builds no map
     ground_truth : replaces the sequence's own
     reading : options that `open_sequence` took (topics, extrinsics), for the manifest: `lslam map` needs them
-    overwrite : replace an earlier run in `out`; resume : go on where it was killed or interrupted, if there is one
-    command : what the manifest says the run was made by; watch : is told of progress, and may stop the run
-    earlier : a run of the same scans whose odometry serves, and is not run again
+    overwrite : replace an earlier run in `out`; resume : continue an unfinished one, if there is one
+    command : command line for the manifest; watch : receives progress, and may stop the run
+    earlier : a run of the same scans whose odometry is reused instead of running it
 
     Raises
     ------
-    RunFinishedError : `resume`, and nothing is left to do. RunFailedError : diverged. InterruptedRunError :
-        `watch.should_stop` said so. GateError : `input.strict` and the run is degraded. In these three, everything up to
-        there is written. InputError, OutputError, UsageError : as named.
+    RunFinishedError : `resume`, and the run is complete. RunFailedError : diverged. InterruptedRunError :
+     `watch.should_stop` returned True. GateError : `input.strict` and the run is degraded. In these three, everything up to
+     there is written. InputError, OutputError, UsageError : as named.
     """
     watch = watch or Watch()
     config = config or Config()

@@ -49,10 +49,10 @@ UPLOADED_FROM = "spool"
 class RunFolder:
     """Output folder of a run, locked by this process while it is open.
 
-    overwrite : clear what an earlier run left; goes_on : keep its checkpoint and keyframes, clear its results
+    overwrite : delete an earlier run's files; goes_on : keep its checkpoint and keyframes, delete its results
 
-    Raises OutputExistsError when the folder is there and neither is set, when it is there and is no run folder, or
-    when another run holds it; OutputError when it cannot be written.
+    Raises OutputExistsError when the folder exists and neither is set, when it exists and is no run folder, or
+    when another process has locked it; OutputError when it cannot be written.
     """
 
     def __init__(self, path: Path, overwrite: bool = False, goes_on: bool = False) -> None:
@@ -133,7 +133,7 @@ class RunFolder:
                 _share(file, self.path / place.get(file.name, f"{KEYFRAMES}/{file.name}"))
 
     def __enter__(self) -> RunFolder:
-        """Copy lslam's log into log.txt while the folder is held."""
+        """Begin to copy lslam's log into log.txt."""
         try:
             self._log_handler = _LogFile(self.path / LOG)
         except OSError as error:
@@ -143,7 +143,7 @@ class RunFolder:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Release the folder."""
+        """Unlock the folder; remove everything if not even the status could be written."""
         if self._log_handler is not None:
             self._log_handler.detach()
         if not (self.path / MANIFEST).exists():
@@ -162,7 +162,7 @@ class RunFolder:
             self._lock = None
 
     def _clear(self, others: Collection[str] = ()) -> None:
-        """Remove an earlier run's files and nothing else, except the `others`; with others, what resuming needs stays too."""
+        """Remove an earlier run's files except the `others`; with others, keyframes and checkpoints for resuming remain too."""
         for name in OURS:
             if name in others:
                 continue
@@ -257,6 +257,7 @@ def require_odometry(path: Path) -> None:
 
 
 def _require_free(path: Path, overwrite: bool) -> None:
+    """Raise OutputExistsError unless `path` is absent, empty, or an unlocked run that may be overwritten."""
     if not path.exists():
         return
     if not path.is_dir():
@@ -322,7 +323,7 @@ def _clear_spools(path: Path) -> None:
 
 
 def default_folder(sequence: str, method: str, now: float | None = None) -> Path:
-    """runs/<sequence>-<method>-<time>, with a number behind it when two runs start in the same second."""
+    """runs/<sequence>-<method>-<time>, with a number appended when two runs start in the same second."""
     stamp = time.strftime("%Y%m%d-%H%M%S", time.localtime(now))
     name = file_safe(sequence)
     folder = Path("runs") / f"{name}-{method}-{stamp}"
@@ -334,8 +335,8 @@ def default_folder(sequence: str, method: str, now: float | None = None) -> Path
 
 
 def spool_of(place: Path) -> Path:
-    """Folder on this machine in which the run for `place` is made, the same for every attempt: `place` itself, or for one
-    in storage a folder in the cache. Raises OutputError.
+    """Local folder in which the run for `place` is written: `place` itself, or for storage a folder in the cache, the same for
+    every attempt. Raises OutputError.
     """
     if not isinstance(place, RemotePath):
         return place
@@ -346,7 +347,7 @@ def spool_of(place: Path) -> Path:
 
 
 def check_place(place: RemotePath, may_replace: bool) -> None:
-    """Raise OutputExistsError for a run in storage that may not be replaced, and for objects that are of no run."""
+    """Raise OutputExistsError for a run in storage that may not be replaced, and for objects that belong to no run."""
     inside = {path.name for path in place.glob("*")}
     if place.is_file() or inside - {*OURS, KEYFRAMES, REPLIES}:
         raise OutputExistsError(f"output folder {place} is not a run of lslam; --overwrite replaces runs only")

@@ -81,6 +81,7 @@ def checks_within(checks: list[MotionCheck], results: list[ScanResult]) -> list[
 
 
 def _part(scans: list[ScanResult], number: int, store: KeyframeStore, config: Config) -> _Part:
+    """A segment of scans with its session of keyframes; without a session if too few scans were registered."""
     scans = [replace(r, segment=number) for r in scans]
     registered = sum(r.status == "ok" for r in scans)
     segment = Segment(number, scans[0].index, scans[-1].index, len(scans), registered)
@@ -225,6 +226,7 @@ def _report(sentences: list[str], manifest: Manifest, others: str) -> None:
 
 
 def _sentence(segment: Segment) -> str:
+    """Sentence about a segment in a frame of its own, or connected after a loss; empty for others."""
     what = f"{segment.span}, segment {segment.number}"
     if segment.frame:
         return f"{what}: not tied to the trajectory, in frame {segment.frame}, of its own: {segment.reason}"
@@ -289,6 +291,7 @@ def _positions(results: list[ScanResult]) -> tuple[Floats, Longs]:
 
 
 def _mark(results: list[ScanResult], stretches: list[Alert], manifest: Manifest, after: str) -> list[ScanResult]:
+    """Results with the scans of the alerts marked as possibly lost; problems of the manifest begin with `after`."""
     sentences = []
     for alert in stretches:
         first, last = results[alert.first].index, results[alert.last].index

@@ -100,7 +100,7 @@ def score(record: RunRecord, sequence: Sequence, config: Config) -> Evaluation |
 
 
 def make_map(folder: RunFolder, job: PreparedRun, record: RunRecord) -> None:
-    """Merged map from the raw scans and the final poses."""
+    """Build and write the merged map from the raw scans and the final poses, if configured."""
     config, watch, manifest = job.config, job.watch, job.manifest
     if not config.map.write or manifest.outcome == "interrupted":
         return
@@ -126,7 +126,7 @@ def make_map(folder: RunFolder, job: PreparedRun, record: RunRecord) -> None:
 
 
 def make_feature_map(folder: RunFolder, job: PreparedRun, record: RunRecord) -> None:
-    """Feature map from the raw scans and the final poses, if requested."""
+    """Build and write the feature map from the raw scans and the final poses, if configured and the method has features."""
     config, watch, manifest, odometry = job.config, job.watch, job.manifest, job.odometry
     if not config.map.write_features or manifest.outcome == "interrupted" or not isinstance(odometry, FeatureSource):
         return
@@ -160,8 +160,8 @@ def in_folder(
 ) -> Iterator[PreparedRun]:
     """Context of the run fitted to its scene, with its folder locked, and uploaded at the end if it is in storage.
 
-    The status is written last, however the block ends. One in storage is filled on this machine; what is to go on stays there.
-    earlier : the run whose odometry serves
+    The status is written last, also after an exception. A run in storage is written on this machine first; an interrupted
+    one remains there. earlier : the run whose odometry is reused
     """
     if out is None:
         yield fit_to_scene(job)
@@ -243,7 +243,7 @@ def write_results(job: PreparedRun, record: RunRecord, back_end: BackEnd, evalua
 
 
 def raise_outcome(manifest: Manifest, config: Config, way_out: str) -> None:
-    """Raise the outcome of a run that is neither done nor degraded; `way_out` ends the sentence."""
+    """Raise the error of a run that diverged, was interrupted, or is degraded under `input.strict`; `way_out` ends the sentence."""
     why = "; ".join(manifest.problems)
     if manifest.outcome == "interrupted":
         raise InterruptedRunError(f"{why}; what was done is written{way_out}")

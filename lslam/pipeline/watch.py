@@ -57,6 +57,7 @@ class RunOutcome:
         return draw_figure(self._figure_data(self.map if what in ON_THE_MAP else None), what)
 
     def _figure_data(self, cloud: ArrayCloud | None = None) -> PlottedRun:
+        """The parts of the record that figures are drawn from; `cloud` is the map, if it was read."""
         record = self.record
         return PlottedRun(
             record.name,

@@ -68,6 +68,7 @@ class BagWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        """Close the bag and move it to its path; after an exception in the block, delete what was written."""
         try:
             if kind is not None:
                 with contextlib.suppress(Exception):
@@ -85,6 +86,7 @@ class BagWriter:
 
 
 def _writer(path: Path, kind: str, is_zstd: bool) -> Any:
+    """Open writer of rosbags for the kind: `bag`, `mcap` or `sqlite`."""
     from rosbags.rosbag1 import Writer as Writer1
     from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
     from rosbags.rosbag2 import Writer as Writer2
@@ -146,7 +148,7 @@ class BagMessages:
         return self._cloud(self.header(stamp_ns, frame), columns, True)
 
     def _cloud(self, head: Any, columns: Mapping[str, NDArray[Any]], is_dense: bool) -> Any:
-        """PointCloud2 with these columns, packed."""
+        """PointCloud2 with header `head` and one little-endian field per column, packed; the column x must exist."""
         dtype = np.dtype([(name, values.dtype.newbyteorder("<")) for name, values in columns.items()])
         table = np.empty(len(columns["x"]), dtype)
         for name, values in columns.items():

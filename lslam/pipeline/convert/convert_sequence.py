@@ -104,7 +104,7 @@ class _Lidar:
 class _Source:
     """Scans of a sequence in order, deskewed on request; damaged ones are logged, counted and left out.
 
-    lidars : what a bag is given, the leading one first
+    lidars : the LiDARs to write into a bag, the leading one first
     """
 
     def __init__(self, sequence: Sequence, trajectory: Trajectory | None, on_scan: Callable[[], None]) -> None:
@@ -131,6 +131,7 @@ class _Source:
         self.keys = of_frames if on_one_topic else of_topics
 
     def scans(self, lidar: _Lidar | None = None) -> Iterator[Scan]:
+        """Readable scans of a LiDAR (None: the leading one), deskewed; raises InputError after the last if none was readable."""
         lidar = lidar or self.lidars[0]
         unreadable = 0
         for k in range(len(lidar.scans)):
@@ -157,6 +158,7 @@ class _Source:
         return change_frame(trajectory, "lidar", self.calibration) if trajectory.frame in FRAMES else trajectory
 
     def _deskew(self, scan: Scan) -> Scan:
+        """The scan deskewed along the trajectory, if there is one; raises InputError for a scan outside of its time."""
         if self.trajectory is None or scan.times is None:
             return scan
         if not self.trajectory.stamps_ns[0] <= scan.stamp_ns <= self.trajectory.stamps_ns[-1]:
@@ -173,6 +175,7 @@ class _Source:
         return replace(stated, T_lidar_imu=None) if getattr(self.sequence, "has_assumed_extrinsics", False) else stated
 
     def info(self) -> SequenceInfo:
+        """Description of the sequence as written, for sequence.toml."""
         return replace(
             self.keys,
             name=self.sequence.name,
@@ -189,6 +192,7 @@ class _Source:
 
 
 def _write_bag(source: _Source, out: Path, kind: str, is_zstd: bool) -> None:
+    """Write description, static transforms, and all messages in order of time into a bag."""
     with BagWriter(out, kind, is_zstd) as writer:
         begin = _first_stamp(source)
         writer.write(INFO_TOPIC, begin, writer.messages.text(sequence_toml_text(source.info())))
@@ -201,7 +205,7 @@ def _write_bag(source: _Source, out: Path, kind: str, is_zstd: bool) -> None:
 
 
 def _messages(source: _Source, messages: BagMessages) -> list[Iterator[Message]]:
-    """Messages of each topic by their stamps."""
+    """For each topic its messages in order of time: stamp (ns), rank among equal stamps, topic, function that makes it."""
     sequence = source.sequence
     imu, gnss, truth = sequence.imu, sequence.gnss, sequence.ground_truth
     topics = [_clouds(source, lidar, rank, messages) for rank, lidar in enumerate(source.lidars, 3)]
@@ -230,7 +234,7 @@ def _first_stamp(source: _Source) -> int:
 
 
 def _transforms(calibration: Calibration) -> dict[tuple[str, str], Any]:
-    """Tree of frames below the LiDAR."""
+    """Known extrinsics T_lidar_frame (4, 4), by (lidar, frame), for /tf_static."""
     T_cam0_lidar = calibration.T_cam0_lidar
     below = {
         **calibration.frames,
@@ -242,6 +246,7 @@ def _transforms(calibration: Calibration) -> dict[tuple[str, str], Any]:
 
 
 def _write_kitti(source: _Source, out: Path) -> None:
+    """Write the scans in KITTI's odometry layout, with all other files."""
     folder = out / "sequences" / NUMBER
     for inside in (folder / POINTS, folder / PER_POINT, out / "poses"):
         inside.mkdir(parents=True)
@@ -253,7 +258,7 @@ def _write_kitti(source: _Source, out: Path) -> None:
 
 
 def _write_sides(source: _Source, folder: Path, poses: Path, stamps: Any) -> None:
-    """Write all files beside the scans."""
+    """Write the files besides the scans: times, calibration, IMU, fixes, ground truth and sequence.toml."""
     sequence, calibration, info = source.sequence, source.calibration, source.info()
     write_times(folder, stamps)
     if calibration.T_cam0_lidar is not None:

@@ -40,16 +40,16 @@ def convert_trajectory(
     overwrite: bool = False,
     place: Georeference | Projection | None = None,
 ) -> Trajectory:
-    """Write `trajectory` to `out` as `kind`, as poses of `frame`, by default the format's usual body. Returns the written one.
+    """Write `trajectory` to `out` as `kind`, as poses of `frame`, by default the format's own body. Returns the written one.
 
-    place : where on the Earth the world of the poses lies. `kml` and `gpx` need a georeference; a projection makes of `csv` a
-        table in its coordinate reference system. Poses that are not finite are left out then.
+    place : where on the Earth the world of the poses lies. `kml` and `gpx` need a georeference; with a projection, `csv` is a
+     table in its coordinate reference system. Poses that are not finite are left out then.
 
     Raises
     ------
     InputError : the change of body needs an extrinsic that `calibration` does not have, or no pose is finite.
-    UsageError : unknown `kind` or `frame`, or a coordinate reference system that does not count in metres.
-    OutputExistsError : `out` is there and `overwrite` is not set.
+    UsageError : unknown `kind` or `frame`, or a coordinate reference system that is not in metres.
+    OutputExistsError : `out` exists and `overwrite` is not set.
     """
     if kind not in FORMATS and kind not in WRITERS:
         raise UsageError(f"no trajectory format {kind!r} to write: {', '.join((*FORMATS, *WRITERS))} are")
@@ -75,7 +75,7 @@ def convert_trajectory(
 
 
 def _convert(trajectory: Trajectory, kind: str, out: Path, calibration: Calibration, frame: str | None) -> Trajectory:
-    """Write the poses in a world that lies nowhere."""
+    """Write the poses in their own world, not georeferenced. Raises InputError for a format with stamps and poses without."""
     file_format = FORMATS[kind]
     result = change_frame(trajectory, frame or file_format.frame or trajectory.frame, calibration)
     if not file_format.has_stamps:
@@ -110,7 +110,8 @@ def change_frame(trajectory: Trajectory, frame: str, calibration: Calibration) -
     """The same motion as poses of the body `frame`.
 
     Camera poses live in the world of camera 0 at the start, T_cam0 = Tr T_world_lidar inv(Tr); IMU poses share the LiDAR's
-    world, T_world_imu = T_world_lidar T_lidar_imu. Raises InputError when the extrinsic for that is unknown.
+    world, T_world_imu = T_world_lidar T_lidar_imu. Raises InputError when the extrinsic for that is unknown, or the trajectory's
+    own body; UsageError for an unknown `frame`.
     """
     if frame == trajectory.frame:
         return trajectory
@@ -156,7 +157,8 @@ Place = tuple[float, float, float]
 def write_kml(path: Path, places: Sequence[Place], times: Sequence[datetime] | None, name: str, about: str) -> None:
     """Write positions lat, lon (deg), height (m), WGS84, as a line, and as a track if `times` (UTC) are known.
 
-    The line lies on the ground: KML counts heights from the sea, ours are above the ellipsoid. They stand in the coordinates.
+    The line is drawn on the ground, since KML's heights are above the sea and ours above the ellipsoid; the coordinates keep
+    them.
     Raises OutputError when the file cannot be written, InputError without fastkml.
     """
     with importing("fastkml", install_hint("geo")), warnings.catch_warnings():
@@ -221,7 +223,10 @@ def find_georeference(source: Path) -> Georeference | None:
 
 
 def georeference_beside(source: Path, words: str) -> Georeference:
-    """As `find_georeference`. Raises UsageError with the way out when that is unknown; words : the option that needs it."""
+    """The georeference of the run that `source` belongs to, by `find_georeference`.
+
+    Raises UsageError with a remedy when it is unknown; words : the option that needs it.
+    """
     georeference = find_georeference(source)
     if georeference is not None:
         return georeference

@@ -76,6 +76,7 @@ def write_gpkg(path: Path, layers: Sequence[GeoLayer], projection: Projection | 
 
 
 def _write_layer(package: Any, layer: GeoLayer, system: Any) -> None:
+    """Create a feature table of the GeoPackage `package` in the reference system `system`, with features and columns."""
     from fudgeo import Field
     from fudgeo.enumeration import ShapeType
     from fudgeo.geometry import LineStringZ, MultiPolygon, PointZ
@@ -131,7 +132,7 @@ def _extent(layer: GeoLayer) -> tuple[float, float, float, float]:
 
 
 def _write_styles(package: Any, layers: Sequence[GeoLayer]) -> None:
-    """Write the table from which QGIS takes the style of a layer when it is opened."""
+    """Write the table layer_styles, from which QGIS takes the default style of each layer."""
     names = ("f_table_catalog", "f_table_schema", "f_table_name", "f_geometry_column", "styleName", "styleQML", "owner")
     rows = [("", "", layer.name, "geom", "lslam", _style(layer), "lslam", 1) for layer in layers if layer.colours]
     with package.connection as connection:
@@ -148,7 +149,7 @@ def _write_styles(package: Any, layers: Sequence[GeoLayer]) -> None:
 
 
 def _style(layer: GeoLayer) -> str:
-    """QGIS' description of how a layer is drawn: in one colour, or in one of each status."""
+    """QML style of a layer for QGIS: one colour, or a colour per status."""
     kind, drawn_as = _SYMBOLS[layer.shape]
     is_single = "" in layer.colours
     about = {"type": "singleSymbol"} if is_single else {"type": "categorizedSymbol", "attr": "status"}
@@ -240,7 +241,7 @@ def _sigmas(covariances: Floats) -> list[float | None]:
 
 
 def building_layers(folder: Path, projection: Projection) -> list[GeoLayer]:
-    """Layers of buildings at their georeferenced places, as in buildings.geojson of the run's folder; none without it."""
+    """Layers of corrected buildings and new walls at their georeferenced positions, from buildings.geojson; none without it."""
     if not (folder / "buildings.geojson").is_file():
         return []
     corrections = read_buildings_geojson(folder / "buildings.geojson")

@@ -67,7 +67,10 @@ class Delivery:
 
 
 def check_delivery(folder: Path, out: Path, overwrite: bool) -> None:
-    """Raise UsageError or OutputExistsError for what cannot be delivered to `out`, before any work is done."""
+    """Raise UsageError or OutputExistsError for what cannot be delivered to `out`, before any work is done.
+
+    Only an earlier delivery may be replaced, and only with `overwrite`.
+    """
     if find_spec("fudgeo") is None:
         raise UsageError(f"a delivery has a GeoPackage, which fudgeo writes: install it with: {install_command('geo')}")
     check_beside(out, folder, "the run")
@@ -87,7 +90,7 @@ def deliver(
 ) -> Delivery:
     """Write the delivery of `survey` to the folder `out`.
 
-    What the run does not have, a map or a floor plan, is left out and said in README.txt. `on_step` is called `STEPS` times.
+    A map or floor plan that the run lacks is left out, with a note in README.txt. `on_step` is called `STEPS` times.
     Raises as `check_delivery`, InputError for a damaged map, OutputError when something cannot be written.
     """
     check_delivery(survey.folder, out, overwrite)
@@ -115,7 +118,7 @@ def deliver(
 
 
 def _write_map(folder: Path, survey: Survey) -> tuple[dict[str, str], list[str]]:
-    """Write map.laz in the delivered coordinates. Returns what it is, and what it lacks."""
+    """Write map.laz in the delivered coordinates. Returns its description by file name, and notes on what is missing."""
     try:
         stored = map_of(survey.folder)
     except InputError:
@@ -140,7 +143,7 @@ def _write_map(folder: Path, survey: Survey) -> tuple[dict[str, str], list[str]]
 
 
 def _write_plan(folder: Path, survey: Survey, files: dict[str, str]) -> tuple[NDArray[np.uint8] | None, Extent]:
-    """Write plan.tif, the delivered map from above. Returns its image and the edges of it, or of the trajectory without a map."""
+    """Write plan.tif, the delivered map from above. Returns image and extent; without a map None and that of the trajectory."""
     if MAP not in files:
         places = np.concatenate([survey.frame.apply(run.trajectory.positions)[:, :2] for run in survey.drives.values()])
         (x, y), (east, north) = places.min(axis=0) - _PAPER_M, places.max(axis=0) + _PAPER_M
@@ -154,7 +157,7 @@ def _write_plan(folder: Path, survey: Survey, files: dict[str, str]) -> tuple[ND
 
 
 def _write_floor_plan(folder: Path, survey: Survey, files: dict[str, str]) -> None:
-    """Write floor_plan.tif where the run has an occupancy map. Its rows are askew in the grid, as the axes of the run are."""
+    """Write floor_plan.tif if the run has an occupancy map. Its rows follow the run's axes, rotated in the projection's grid."""
     path = survey.folder / "occupancy.npz"
     if not path.is_file():
         return
@@ -173,6 +176,7 @@ def _write_floor_plan(folder: Path, survey: Survey, files: dict[str, str]) -> No
 
 
 def _sheet(survey: Survey, image: NDArray[np.uint8] | None, extent: Extent, notes: list[str]) -> SurveySheet:
+    """Content of the one-page PDF: plan, drives, points, accuracy, coordinates and limits."""
     is_local = survey.frame.epsg is None
     return SurveySheet(
         title=f"Survey of {survey.name}",
@@ -191,7 +195,7 @@ def _sheet(survey: Survey, image: NDArray[np.uint8] | None, extent: Extent, note
 
 
 def trajectory_text(survey: Survey, name: str) -> str:
-    """Table of the poses of a drive, with what its columns mean in lines that begin with #."""
+    """Table of the poses of a drive as CSV; lines that begin with # explain its columns."""
     run, frame = survey.drives[name], survey.frame
     poses, stamps, covariances = frame.carry(run.trajectory.poses), run.trajectory.stamps_ns, survey.covariances(run)
     is_local, utc = frame.epsg is None, utc_of(stamps)
@@ -243,7 +247,7 @@ def write_trajectories(folder: Path, survey: Survey) -> list[str]:
 
 
 def layers_of(survey: Survey) -> list[GeoLayer]:
-    """Layers of the GeoPackage: poses, surveyed points, loops and buildings, those that there are."""
+    """Layers of the GeoPackage: poses, and surveyed points, loops and buildings where available."""
     layers = pose_layers(survey.drives, survey.frame)
     if survey.points:
         layers.append(_points_layer(survey))
@@ -254,6 +258,7 @@ def layers_of(survey: Survey) -> list[GeoLayer]:
 
 
 def _points_layer(survey: Survey) -> GeoLayer:
+    """Layer of all surveyed points with their residuals, m."""
     places, off = (np.concatenate([getattr(p, name) for p in survey.points]) for name in ("places", "residuals"))
     columns = {
         "point": [name for p in survey.points for name in p.names],
@@ -267,7 +272,7 @@ def _points_layer(survey: Survey) -> GeoLayer:
 
 
 def _loops_layer(survey: Survey) -> list[GeoLayer]:
-    """A line for each loop candidate, from scan to scan; none where the run looked for none."""
+    """Layer with a line for each loop candidate, from scan to scan; no layer where the run searched none."""
     path, drives = survey.folder / "loops.csv", list(survey.drives.values())
     if not path.is_file():
         return []

@@ -109,15 +109,15 @@ class Survey:
 
 
 def read_survey(folder: Path, crs: OutputCrs | None, check: Path | None = None, takes_any: bool = False) -> Survey:
-    """Read what a run or a merge left in `folder`.
+    """Read a finished run or merge in `folder` for delivery.
 
     crs : coordinates to deliver in, None for those of the run; check : file of points that the run did not use
-    takes_any : whether a run that diverged or was interrupted is read too
+    takes_any : also read a run that diverged or was interrupted
 
     Raises
     ------
-    RunFailedError : such a run is not to be delivered. UsageError : no place on the Earth is known, heights in `crs` cannot be
-    had, or a check point held the run. InputError : a file is missing or damaged.
+    RunFailedError : such a run is not to be delivered. UsageError : the run is not georeferenced, heights in `crs` are
+    unavailable, or a check point was used by the run. InputError : a file is missing or damaged.
     """
     require_run(folder)
     manifest = read_json(folder / MANIFEST)
@@ -195,7 +195,7 @@ def _control(survey: Survey, projection: Projection) -> SurveyedPoints | None:
 
 
 def _check_points(survey: Survey, projection: Projection, path: Path, control: SurveyedPoints | None) -> SurveyedPoints:
-    """Points of a person that the run did not use, beside its final poses."""
+    """Check points that the run did not use, with their residuals; raises UsageError for one that it did use."""
     if len(survey.drives) > 1:
         raise UsageError(
             f"--check: {survey.folder} is a merge, whose scans have no numbers of their own: check one of its runs"
@@ -231,7 +231,7 @@ def _points(
 
 
 def accuracy(survey: Survey) -> list[str]:
-    """What was measured of the accuracy, by points kept out and by those that were used, and the internal precision."""
+    """Sentences on the accuracy at check and control points, of satellite fixes, and on the precision by covariances."""
     by_kind = {points.kind: points for points in survey.points}
     sentences = []
     if (check := by_kind.get("kept out")) is not None:
@@ -273,7 +273,7 @@ def _pair(values: Any) -> str:
 
 
 def _fixes(survey: Survey) -> list[str]:
-    """Sentence about satellite fixes, where a run has used some."""
+    """Sentence on satellite fixes and their residuals, if the run used some."""
     facts = survey.manifest.get("georeference", {})
     if not (facts.get("fixes") and facts.get("used")):
         return []
@@ -303,7 +303,7 @@ def coordinates(survey: Survey) -> list[str]:
 
 
 def epoch(survey: Survey) -> str:
-    """When the recording was made, as a date and a year with decimals; or that nobody knows."""
+    """Date of the recording, also as a decimal year; or that it is unknown."""
     times = utc_of(next(iter(survey.drives.values())).trajectory.stamps_ns)
     if times is None:
         return "unknown, stamps of the recording are no Unix time"
@@ -328,7 +328,7 @@ def limits(survey: Survey) -> list[str]:
 
 
 def making(survey: Survey) -> list[str]:
-    """Input, method, version and command."""
+    """Sentences on recording, method, version and date of the run."""
     manifest, scans = survey.manifest, sum(len(run.trajectory) for run in survey.drives.values())
     run = next(iter(survey.drives.values()))
     count = sum(status == "ok" for one in survey.drives.values() for status in one.statuses)
@@ -342,7 +342,7 @@ def making(survey: Survey) -> list[str]:
 
 
 def readme(survey: Survey, files: Mapping[str, str], notes: Sequence[str], command: str) -> str:
-    """README.txt: files by name with what they are, and all of the above; notes : what is missing, and why."""
+    """Text of README.txt: files with descriptions, and all sentences on the survey; notes : what is missing, and why."""
     sections: dict[str, Sequence[str]] = {
         "Coordinates": coordinates(survey),
         "Accuracy": accuracy(survey),

@@ -74,6 +74,7 @@ def examine_cameras(sequence: Sequence, findings: Findings) -> list[Facts]:
 
 
 def _facts(camera: Camera, offset: Offset | None) -> Facts:
+    """JSON-ready facts about a camera and its measured offset."""
     steps = np.diff(camera.stamps_ns)
     return {
         "name": camera.name,
@@ -95,6 +96,7 @@ def _facts(camera: Camera, offset: Offset | None) -> Facts:
 
 
 def _judge(name: str, offset: Offset, findings: Findings) -> None:
+    """Add findings where the offset of a camera in pixels or in time is significant."""
     if np.any(np.abs(offset.pixels) > np.maximum(_SURE * offset.pixels_sigma, np.maximum(offset.beams, 1.0))):
         right, down = offset.pixels
         findings.add(
@@ -112,9 +114,9 @@ def _judge(name: str, offset: Offset, findings: Findings) -> None:
 
 
 def offset_of(camera: Camera, sequence: Sequence, stamps_ns: Longs, motion: ContinuousMotion) -> Offset | None:
-    """Offset of a camera, from images during the scans with `stamps_ns` (N,) along `motion`; None where too few say anything.
+    """Offset of a camera, from images during the scans with `stamps_ns` (N,) along `motion`; None with too few usable images.
 
-    Of every image the edges of depth in the scan of its time are moved by some pixels, and by the motion of some time, to where
+    For each image the edges of depth in the scan of its time are shifted by pixels, and by the motion in some time, to where
     the image has most edges. The standard deviations are those of leaving out one image (jackknife).
     """
     spare = round(1e9 * _FARTHEST_S)
@@ -161,7 +163,7 @@ def beam_spacing(scan: Scan) -> Floats:
 
 
 def depth_edges(scan: Scan) -> tuple[NDArray[np.intp], Floats]:
-    """Points of a scan behind which the range jumps to the next beam of their ring, and by how much of their range (N,)."""
+    """Indices (N,) of points behind which the range jumps to the next beam of their ring, and the jump / range (N,), at most 1."""
     assert scan.rings is not None
     r = np.linalg.norm(scan.points, axis=1).astype(np.float64)
     azimuth = portable.arctan2(scan.points[:, 1].astype(np.float64), scan.points[:, 0].astype(np.float64))
@@ -229,7 +231,7 @@ def _peak(scores: Floats, reach: int) -> Floats:
 
 
 def sentence_of(facts: Facts) -> str:
-    """A camera in words."""
+    """Sentence about a camera, from its facts."""
     rate = "" if facts["rate_hz"] is None else f", {facts['rate_hz']:.1f} Hz"
     width, height = facts["size"]
     text = f"{facts['name']}: {count_of(facts['images'], 'image')} of {width} x {height}{rate}, {facts['model']}"

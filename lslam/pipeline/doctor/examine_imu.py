@@ -100,6 +100,7 @@ def allan_deviation(values: Floats, rate: float) -> tuple[Floats, Floats]:
 
 
 def _by_allan(values: Floats, rate: float) -> Noise:
+    """Noise density, bias instability and random walk by the Allan deviation of values (N, 3); the latter for long data only."""
     times, each = allan_deviation(values, rate)
     deviation = np.sqrt(np.mean(each**2, axis=1))
     # White noise rules the shorter half of the times, all below a second, over which it falls with their root.
@@ -144,7 +145,7 @@ _GAP_S = 0.1
 
 
 def examine_imu(sequence: Sequence, findings: Findings) -> Facts | None:
-    """Facts of the IMU, None when there is none."""
+    """Facts of the IMU, None when there is none; faults of time, extrinsics, gravity and rates become findings."""
     imu = sequence.imu
     if imu is None or not len(imu):
         return None
@@ -251,6 +252,7 @@ def _tilt(up: Floats, tilt: float) -> Finding:
 
 
 def _examine_gyro(imu: ImuStream, findings: Findings) -> Facts:
+    """Median rate of the gyroscope; a finding where it suggests deg/s."""
     rates = np.linalg.norm(imu.gyro, axis=1)
     median = float(np.median(rates)) if len(rates) else 0.0
     if median > _TURNING:

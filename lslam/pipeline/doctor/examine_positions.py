@@ -90,7 +90,7 @@ def examine_gaps(sequence: Sequence, findings: Findings) -> None:
 
 
 def examine_gnss(sequence: Sequence, findings: Findings) -> Facts | None:
-    """Facts of the fixes, None when there are none."""
+    """Facts of the satellite fixes, None without valid ones; invalid fixes, wrong stamps and jumps become findings."""
     gnss = sequence.gnss
     if gnss is None or not len(gnss):
         return None
@@ -187,7 +187,7 @@ def examine_units(
 def _factor_of_scans(step: float, period: float) -> float:
     """Unit factor by which the `step` between scans, s, is too long; 0 when it may be right.
 
-    period : s, as stated, or of the stamps themselves where nothing is
+    period : s, as stated, or by the stamps themselves if none is stated
     """
     if _POSSIBLE[0] <= step <= _POSSIBLE[1]:
         return 0.0
@@ -201,9 +201,9 @@ def _factor_of_scans(step: float, period: float) -> float:
 
 
 def _factor_beside(stamps: Stamps, span: float, usual: tuple[float, float]) -> float:
-    """Unit factor by which the time between `stamps` is too long; 0 when it may be right.
+    """Unit factor by which the time between `stamps` is too long relative to the scans; 0 when it may be right.
 
-    span : s, of the scans; usual : s between two stamps of such a sensor
+    span : s, of the scans; usual : s, range of plausible times between two stamps of such a sensor
     """
     if len(stamps) < 2 or span <= 0:
         return 0.0
@@ -224,6 +224,7 @@ def _factors() -> list[float]:
 
 
 def _suspect(what: str, factor: float, would_be: str) -> tuple[str, str]:
+    """Finding and remedy for stamps in a wrong unit: `what` is `factor` times too slow (> 1) or too fast; `would_be` if mended."""
     if factor > 1:
         is_so, way = f"slow, as {UNITS[factor][0]} taken for s are", f"divide them by {factor:,.0f}"
     else:

@@ -42,7 +42,7 @@ def examine_bag(bag: Bag, uses: Mapping[str, str]) -> Facts:
 
     uses : purpose of each topic in use; `remarks` are sentences about files that were left out, lost or unpacked
 
-    A rate is that of the steps between the first and the last message, None below two.
+    A rate, Hz, is by the time from the first to the last message, None below two messages.
     """
     spans = [span for topic in bag.topics if (span := _span(bag, topic)) is not None]
     begin = min((first for first, _ in spans), default=None)
@@ -104,7 +104,7 @@ _FOLLOWS = {
 def inspect(sequence: Sequence, samples: int | None = 50, is_quick: bool = False, with_cameras: bool = False) -> Facts:
     """JSON-ready facts about `sequence`; point statistics come from `samples` scans spread evenly, all when None.
 
-    `findings` are what is wrong: `code`, `what`, `way_out`; `problems` the same as sentences. Scans that cannot be read are
+    `findings` are the faults: `code`, `what`, `way_out`; `problems` the same as sentences. Unreadable scans are
     among them. With `is_quick` no scan is registered, so the IMU's clock and axes are not compared with the scans, and
     no clock of points without times is sought. With `with_cameras` cameras are checked against the scans, which are registered
     for it; raises InputError where there is none.
@@ -171,6 +171,7 @@ def inspect(sequence: Sequence, samples: int | None = 50, is_quick: bool = False
 
 
 def _ground_truth(truth: Trajectory | None, stamps_ns: Longs) -> Facts | None:
+    """Facts of the ground truth: numbers of poses, frame, path length and extent, m, during the scans; None without it."""
     if truth is None or not len(truth):
         return None
     inside = (truth.stamps_ns >= stamps_ns[0]) & (truth.stamps_ns <= stamps_ns[-1])
@@ -188,7 +189,7 @@ def _ground_truth(truth: Trajectory | None, stamps_ns: Longs) -> Facts | None:
 
 
 def examine_stamps(sequence: Sequence, findings: Findings) -> Facts:
-    """Check rate and gaps of the scans. Stamps that go back were replaced, and reported, by the reader."""
+    """Check rate and gaps of the scans. Stamps that went back have been replaced, and reported, by the reader."""
     stamps = sequence.stamps_ns
     steps = np.diff(stamps) * 1e-9
     median = float(np.median(steps)) if len(steps) else 0.0
@@ -211,7 +212,7 @@ def examine_stamps(sequence: Sequence, findings: Findings) -> Facts:
 
 
 def examine_points(sequence: Sequence, indices: NDArray[Any], findings: Findings) -> Facts:
-    """Statistics over the scans `indices`. Unreadable scans are count_of, and the first of them named."""
+    """Statistics over the scans `indices`. Unreadable scans are counted, and a finding names the first of them."""
     scans: list[Facts] = []
     unreadable: list[str] = []
     for index in indices:
@@ -258,7 +259,7 @@ def examine_points(sequence: Sequence, indices: NDArray[Any], findings: Findings
 
 
 def _examine_frame(directions: list[Longs], findings: Findings) -> None:
-    """Check that scans are in their sensor's frame: then the ground is always at one height below (or above) the origin."""
+    """Check that scans are in their sensor's frame: the ground must be at a constant height below (or above) the origin."""
     shares = [empty_share(directions[0], later) for later in directions[1:]]
     if len(shares) > 1 and np.median(shares) > EMPTIED_SHARE:
         findings.add(
@@ -302,6 +303,7 @@ def rings_rule(sequence: Sequence) -> tuple[str | None, str]:
 
 
 def _scan_facts(scan: Scan) -> Facts:
+    """Facts of one scan: counts of points and of faulty ones, quantiles of range (m) and elevation (deg), ranges of its fields."""
     points = scan.points
     finite = np.isfinite(points).all(axis=1)
     zero = (points == 0).all(axis=1)

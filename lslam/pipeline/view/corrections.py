@@ -68,7 +68,7 @@ class Edits(BaseModel):
 
 
 class Corrections:
-    """The corrections of a run, and what its scans look like on each other.
+    """Corrections of a run that a person enters on its page, and views of its scans registered on each other.
 
     Raises InputError for a run that cannot be read.
     """
@@ -81,6 +81,7 @@ class Corrections:
 
     @cached_property
     def _store(self) -> KeyframeStore:
+        """Keyframes of the run at odometry's poses, as loop search used them; raises InputError when the run kept none."""
         store = KeyframeStore(self.folder / KEYFRAMES)
         if not len(store):
             raise InputError(f"{self.folder} kept no keyframes: run the sequence again, with its loops")
@@ -94,7 +95,7 @@ class Corrections:
         return store
 
     def edits(self, words: object = None) -> dict[str, Any]:
-        """What was said before: the files of the run folder, else those that its graph was made with."""
+        """The present corrections: those of the run folder, else those that its graph was made with; `words` is ignored."""
         config, pairs, points = self.run.config, [], []
         if path := self._before(EDITS, config.loops.file):
             for pair in read_named_pairs(path):
@@ -111,7 +112,7 @@ class Corrections:
         return Edits(pairs=pairs, points=points).model_dump()
 
     def save(self, document: Any) -> dict[str, Any]:
-        """Write both files, and remove one without rows. Raises UsageError for what they cannot hold, OutputError."""
+        """Validate and write both files; one without rows is removed. Raises UsageError for invalid entries, OutputError."""
         try:
             edits = Edits.model_validate(document)
             for point in edits.points:
@@ -137,9 +138,9 @@ class Corrections:
         return words
 
     def pair(self, words: Mapping[str, str]) -> dict[str, Any]:
-        """Two scans on each other, by the words `a` and `b`, their numbers: registered as `lslam graph` registers a known pair.
+        """Register two scans, numbers `a` and `b` in `words`, as `lslam graph` registers a known pair; their view and verdict.
 
-        Raises UsageError where they are none of the run's, or lie at one keyframe.
+        Raises UsageError where they are not of the run, or share one keyframe.
         """
         numbers = [self._result(words.get(name, "")).index for name in "ab"]
         older, newer = (Instant(f"scan {number}", scan=number) for number in numbers)
@@ -183,7 +184,7 @@ class Corrections:
 
 
 def _write(path: Path, kind: type[BaseModel], rows: Sequence[BaseModel]) -> None:
-    """Write the rows as CSV, with columns that may be empty only where one of them is not; no rows are no file."""
+    """Write the rows as CSV; optional columns are included only if used. Without rows the file is removed."""
     if not rows:
         path.unlink(missing_ok=True)
         return

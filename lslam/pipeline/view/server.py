@@ -74,7 +74,7 @@ class Site:
 
 
 class RunServer(ThreadingHTTPServer):
-    """Sites of runs at `/TOKEN/`, that of the first, and `/TOKEN/1/`, ...
+    """HTTP server of the sites of runs: `/TOKEN/` for the first, `/TOKEN/1/`, ... for others.
 
     port : 0 for any that is free. Raises UsageError when it is in use.
     """
@@ -103,7 +103,7 @@ class RunServer(ThreadingHTTPServer):
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """One connection."""
+    """Handler of one connection."""
 
     server: RunServer
     protocol_version = "HTTP/1.1"
@@ -135,6 +135,7 @@ class _Handler(BaseHTTPRequestHandler):
         log.debug("view: %s", (format % args).replace(self.server.token, "TOKEN"))
 
     def _answer(self, method: Callable[[], Answer]) -> None:
+        """Send the answer of `method`, or an error status: refused, LslamError (422), any other exception (500)."""
         status, answer = HTTPStatus.OK, Answer("application/json", b"{}")
         try:
             self._require_own()
@@ -151,6 +152,7 @@ class _Handler(BaseHTTPRequestHandler):
         self._send(status, answer)
 
     def _send(self, status: HTTPStatus, answer: Answer) -> None:
+        """Send status, headers and body or file of the answer; no body for HEAD."""
         stream = answer.file.open("rb") if answer.file is not None else None
         try:
             size = len(answer.body) if stream is None else stream.seek(0, 2)
@@ -169,7 +171,7 @@ class _Handler(BaseHTTPRequestHandler):
                 stream.close()
 
     def _require_own(self) -> None:
-        """Refuse what other pages ask, also under a name of theirs that leads here."""
+        """Raise RefusedError for requests to another host name or from pages of another origin (DNS rebinding, CSRF)."""
         hosts = self.headers.get_all("Host") or []
         if len(hosts) != 1 or hosts[0].lower() not in self.server.names:
             raise RefusedError(HTTPStatus.FORBIDDEN, "this server has another name")
@@ -178,7 +180,7 @@ class _Handler(BaseHTTPRequestHandler):
             raise RefusedError(HTTPStatus.FORBIDDEN, "other pages are not answered")
 
     def _site_of(self) -> tuple[Site, str, str]:
-        """The site, the path below its address, and the query."""
+        """The site of the request's address, the path below it, and the query. Raises RefusedError without the token."""
         parts = urlsplit(self.path)
         first, _, path = unquote(parts.path, errors="strict").lstrip("/").partition("/")
         if not secrets.compare_digest(first.encode(), self.server.token.encode()):
@@ -189,6 +191,7 @@ class _Handler(BaseHTTPRequestHandler):
         return self.server.sites[0], path, parts.query
 
     def _get(self) -> Answer:
+        """Answer of a GET request: page, JSON of the API, node of the octree, or file. Raises RefusedError."""
         try:
             site, path, query = self._site_of()
             words = {name: values[-1] for name, values in parse_qs(query, max_num_fields=9).items()}
@@ -202,6 +205,7 @@ class _Handler(BaseHTTPRequestHandler):
         return _file(site.folder, path) if node is None else Answer("application/octet-stream", node)
 
     def _post(self) -> Answer:
+        """Answer of a POST request with a JSON body to the API. Raises RefusedError."""
         try:
             site, path, _ = self._site_of()
             size = int(self.headers.get("Content-Length", "-1"))
@@ -227,7 +231,7 @@ def _json(document: Any) -> Answer:
 
 
 def _file(folder: Path, path: str) -> Answer:
-    """A file of the run folder, wherever its links lead within it."""
+    """Answer with a file inside the run folder; raises RefusedError for any other path."""
     try:
         root, file = folder.resolve(), (folder / path).resolve()
         is_ours = (

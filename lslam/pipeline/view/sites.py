@@ -64,7 +64,7 @@ SAMPLE = 400_000  # points whose intensities give the range that is shown
 
 
 class ViewedSites:
-    """The runs of a server, the one that was named first; `stop` ends what works for them."""
+    """The runs of a server, the first one first; `stop` ends their threads and processes."""
 
     def __init__(self, server: RunServer) -> None:
         self._server = server
@@ -124,7 +124,7 @@ class ViewedSites:
         return self._state(number)
 
     def _state(self, number: int) -> dict[str, Any]:
-        """What the child does; once it is done what has changed, and the page of its run."""
+        """State of the running `lslam graph`; when done, also the page of the new run and how much its poses changed."""
         with self._lock:
             if self._job is None or self._of is None:
                 return {"state": "none"}
@@ -150,9 +150,8 @@ def change_between(old: Trajectory, new: Trajectory) -> dict[str, Any]:
 
 
 def page_of(folder: Path) -> Answer:
-    """The report of a run.
+    """Answer with the report of a run; one of another version is sandboxed, so that its script has no access here.
 
-    A page of another version, or whoever wrote it, is shown by itself: its script reaches nothing here.
     Raises InputError when it cannot be read.
     """
     with input_errors(folder / REPORT):
@@ -201,7 +200,7 @@ def _page(text: str, rules: str) -> Answer:
 
 
 class GraphJob:
-    """The child. `words` are those of `lslam graph` after the run; `out` is its new folder."""
+    """Child process of `lslam graph`, with the arguments `words` after the run; `out` is its new folder."""
 
     def __init__(self, run: Path, words: list[str]) -> None:
         self.out = next_folder(run)
@@ -229,7 +228,7 @@ class GraphJob:
         return self._child.poll() is None
 
     def state(self) -> dict[str, Any]:
-        """`running`, `done`, `stopped` or `failed`, and what it said."""
+        """State of the child (`running`, `done`, `stopped` or `failed`), its folder, and its last lines of output."""
         code = self._child.poll()
         if code is not None:
             self._reader.join(PATIENCE_S)
@@ -238,7 +237,7 @@ class GraphJob:
         return {"state": word, "out": self.out.name, "said": list(self._said)}
 
     def stop(self) -> None:
-        """Ask it to stop as Ctrl-C does, and end it where it does not."""
+        """Terminate the child as Ctrl-C does, and kill it where it does not end in time."""
         if self.is_running:
             self._is_asked = True
             self._child.terminate()
@@ -256,7 +255,7 @@ class GraphJob:
 
 
 def next_folder(run: Path) -> Path:
-    """RUN-graph beside the run, or the first of RUN-graph-2, ... that is free. Raises OutputExistsError when none is."""
+    """RUN-graph beside the run, or the first of RUN-graph-2, ... that is free. Raises OutputExistsError when none is free."""
     named = run.resolve()
     for number in range(1, 1000):
         folder = named.with_name(f"{named.name}-graph" + (f"-{number}" if number > 1 else ""))
@@ -315,6 +314,7 @@ class MapTiles:
         return cKDTree(np.nan_to_num(np.concatenate(self._tracks), nan=1e12))
 
     def _build(self) -> None:
+        """Find the octree in the cache or build it; failures are logged and reported in the state."""
         try:
             stored = map_of(self._run)
             base = cache_folder("octrees")
@@ -334,6 +334,7 @@ class MapTiles:
             self._said = {"error": str(error)}
 
     def _write(self, folder: Path, cloud: MapCloud) -> None:
+        """Write the octree of the cloud into `folder`, by way of a temporary folder."""
         sample = thin_out(cloud, SAMPLE).intensity
         shades = usual_range(np.zeros(0) if sample is None else sample.astype(np.float64))
         with tempfile.TemporaryDirectory(prefix="part-", dir=folder.parent) as place:
