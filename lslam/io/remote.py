@@ -49,9 +49,9 @@ def as_path(place: str | Path) -> Path:
 class RemotePath(PosixPath):
     """Path in object storage.
 
-    Each call asks the storage, except for entries that a listing of their folder has just returned.
+    Each call sends a request, except for entries that a listing of their folder has just returned.
 
-    Raises FileNotFoundError for what is not there, StorageError for a failed request (permission, credentials, network),
+    Raises FileNotFoundError for missing objects, StorageError for a failed request (permission, credentials, network),
     UsageError where the extra is missing.
     """
 
@@ -185,6 +185,7 @@ class RemotePath(PosixPath):
         return path
 
     def _info(self) -> dict[str, Any]:
+        """Attributes of the object by its file system, requested once."""
         known = self.__dict__.get("_known")
         if known is None:
             with _asking(self, "read") as (system, place):
@@ -207,6 +208,7 @@ def _stat(info: dict[str, Any]) -> os.stat_result:
 
 
 def _changed_ns(info: dict[str, Any]) -> int:
+    """Time of the last change, ns since 1970, 0 if unknown."""
     said = next((info[name] for name in _TIMES if info.get(name) is not None), 0)
     if isinstance(said, str):
         try:
@@ -218,7 +220,7 @@ def _changed_ns(info: dict[str, Any]) -> int:
 
 @contextmanager
 def _asking(path: RemotePath, what: str) -> Iterator[tuple[Any, str]]:
-    """File system of a path and its name there. Errors of the block become one sentence."""
+    """Context with a path's file system and its name there. Exceptions become StorageError (`path` cannot be `what`)."""
     scheme = str(path).partition("://")[0]
     try:
         from fsspec.core import url_to_fs
@@ -248,6 +250,7 @@ def _silence() -> None:
 
 
 def _reason(error: Exception) -> str:
+    """Reason of a failed request, in words."""
     name = type(error).__name__
     said = sentence(" ".join(str(error).split()))[:300]
     if name in _NO_CREDENTIALS:

@@ -57,7 +57,7 @@ class RangedFile:
             self._expected = sorted(numbers)
 
     def read(self, position: int, size: int) -> bytes:
-        """Read `size` bytes from `position`, fewer where the object ends."""
+        """Read `size` bytes from `position`, fewer at the end of the object."""
         size = min(size, self.size - position)
         if size <= 0:
             return b""
@@ -74,7 +74,7 @@ class RangedFile:
         return slice(at, at + _AHEAD if self._expected[at : at + 1] == [number] else at)
 
     def _block(self, number: int, last: int) -> bytes:
-        """One block of the object.
+        """Block `number` of the object, from the cache.
 
         If it must be fetched, the blocks up to `last` and the announced ones are fetched with it.
         """
@@ -173,7 +173,7 @@ class ChunkFile:
     def part(self, chunk: Chunk | None, offset: int, size: int, is_head: bool = False) -> bytes:
         """Read at most `size` bytes of the records of `chunk` from `offset`. If `chunk` is None, read from the file itself.
 
-        is_head : only the beginnings of the chunk's messages will be read
+        is_head : a hint: only the beginnings of the chunk's messages will be read
 
         Raises InputError when the chunk cannot be decompressed.
         """
@@ -232,7 +232,7 @@ def unpack(compression: str, pieces: Iterator[bytes], most: int) -> bytes:
 
 
 def _codec(name: str) -> Callable[[], Any]:
-    """Factory of a decompressor whose `decompress` takes a `max_length`."""
+    """Decompressor class for `bz2`, `lz4` or zstd (any other name), whose `decompress` takes a `max_length`."""
     if name == "bz2":
         return bz2.BZ2Decompressor
     if name == "lz4":

@@ -167,7 +167,7 @@ class Bag:
             problems.append(f"{len(broken) - _MOST_MESSAGES} more messages of {topic.name} are damaged")
 
     def decode(self, topic: BagTopic, data: bytes) -> Any:
-        """A message as an object with the fields of its type. Raises InputError when it does not fit the type."""
+        """The message as an object with the fields of its type. Raises InputError when it does not fit the type."""
         from rosbags.serde import SerdeError
 
         store = typestore(topic.encoding)
@@ -234,7 +234,7 @@ def _is_within(topics: list[Topic], others: list[Topic]) -> bool:
 
 
 def _check_encodings(path: Path, topics: list[BagTopic]) -> None:
-    """Raise InputError for a topic of ROS 1 that is one of ROS 2 as well."""
+    """Raise InputError for a topic that is recorded both by ROS 1 and by ROS 2."""
     legible = [topic for topic in topics if len(topic) and topic.encoding in _ENCODINGS]
     for topic, other in pairwise(legible):
         if other.name == topic.name and other.encoding != topic.encoding:
@@ -246,7 +246,7 @@ def _check_encodings(path: Path, topics: list[BagTopic]) -> None:
 
 
 def _reader(path: Path, there: Path) -> _Reader:
-    """Reader of a file, chosen by its first bytes, else by its name."""
+    """Reader class of a file, chosen by its first bytes, else by its name; `there` is the file or its decompressed copy."""
     by_name = READERS[suffix_of(path)]
     if isinstance(there, RemotePath):
         return by_name
@@ -340,6 +340,10 @@ def _kind(path: Path) -> str:
 
 
 def _unpack(path: Path, kind: str, target: Any) -> str:
+    """Decompress `path` of the compression `kind` into `target`; returns a sentence on missing data, empty if complete.
+
+    Raises InputError for data that are damaged from the begin or expand suspiciously, OutputError for a full disk.
+    """
     size, most = 0, max(_MOST * path.stat().st_size, _LEAST)
     library = zstd() if kind == "zstd" else import_module(_LIBRARIES[kind])
     try:

@@ -42,7 +42,7 @@ class Record(NamedTuple):
 
 
 class ChunkedBag(ABC):
-    """One file: `topics`, and `loss`, a sentence when it was cut off. The kinds of its records have numbers.
+    """One file: `topics`, and `loss`, a sentence when it was cut off. Record kinds have numbers (`op`).
 
     NAMES : records that name channels; FOOTER : the last record, 0 in a format without one
     """

@@ -131,7 +131,7 @@ def is_static(topic: BagTopic) -> bool:
 
 
 def read_transforms(bag: Bag, topic: BagTopic, problems: list[str], most: int | None = None) -> Transforms:
-    """`T_parent_child` (N, 4, 4) by (parent, child), from all or the first few messages of a TFMessage topic."""
+    """`T_parent_child` (N, 4, 4) by (parent, child), from the first `most` messages of a TFMessage topic; None: all."""
     rows_of: dict[tuple[str, str], list[list[float]]] = {}
 
     def note(data: bytes) -> None:

@@ -43,6 +43,7 @@ class Ros1Bag(ChunkedBag):
         return "an old version, `rosbag fix` brings it to 2.0" if is_old else "no ROS 1 bag"
 
     def _record(self, chunk: Chunk | None, offset: int, is_head: bool = False) -> Record:
+        """The record at `offset` of a chunk (None: of the file), with its header fields by name."""
         head = self._file.part(chunk, offset, _HEADER, is_head)
         (length,) = struct.unpack_from("<I", head)
         if length + 8 > len(head):
@@ -82,7 +83,7 @@ class Ros1Bag(ChunkedBag):
 
 
 def _fields(block: bytes) -> dict[bytes, bytes]:
-    """Fields `name=value` of a record header."""
+    """Fields `name=value` of a record header, as bytes by name."""
     fields, at = {}, 0
     while at < len(block):
         (n,) = struct.unpack_from("<I", block, at)
@@ -143,6 +144,7 @@ class McapFile(ChunkedBag):
         return channel, stamp
 
     def _note_name(self, record: Record, data: bytes) -> None:
+        """Store the schema or channel that the record defines, by its number."""
         (number,) = struct.unpack_from("<H", data)
         if record.op == _SCHEMA:
             self._schemas[number] = _text(data, 2)[0]

@@ -32,7 +32,7 @@ def is_copc(path: Path) -> bool:
 def octree(axes: Sequence[NDArray[np.int32]], edge: int) -> tuple[Longs, NDArray[np.int32]]:
     """Nodes of points in a cube of `edge` steps; axes : x, y, z (N,) of the points, whole steps from its lowest corner.
 
-    A node with many points keeps the first one of each of its cells, and its eight children have the others, down to cells as
+    A node with many points keeps the first one of each of its cells, and its eight children get the others, down to cells as
     small as a step. Returns the keys (K, 4) of the nodes, their level and x, y, z in it, and the node (N,) of each point.
     """
     count = len(axes[0])

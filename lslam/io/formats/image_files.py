@@ -56,9 +56,9 @@ def write_png(path: Path, image: Image) -> None:
 
 
 def from_pixels(data: NDArray[np.uint8], width: int, height: int, step: int, encoding: str, source: str) -> Image:
-    """Pixels (height, width, 3) of the bytes of an uncompressed ROS image, `step` bytes a row.
+    """Pixels (height, width, 3), RGB, of the bytes of an uncompressed ROS image with rows of `step` bytes.
 
-    Raises InputError naming `source` for an encoding that is not read, and for too few bytes.
+    Raises InputError naming `source` for an unsupported encoding, and for too few bytes.
     """
     kind = encoding.split(";")[0].strip()
     channels, order = (1, (0, 0, 0)) if kind in _BAYER else _ENCODINGS.get(kind, (0, (0, 0, 0)))
@@ -74,7 +74,7 @@ def from_pixels(data: NDArray[np.uint8], width: int, height: int, step: int, enc
 
 
 def _of_cells(raw: NDArray[np.uint8], row: int, column: int) -> Image:
-    """Colours of a mosaic, the same for the four pixels of a cell; `row`, `column`: where red is in it."""
+    """RGB of a Bayer mosaic, the same for the four pixels of a cell; `row`, `column`: position of red in the cell."""
     even = raw[: raw.shape[0] // 2 * 2, : raw.shape[1] // 2 * 2].astype(np.uint16)
     red, blue = even[row::2, column::2], even[1 - row :: 2, 1 - column :: 2]
     green = (even[row::2, 1 - column :: 2] + even[1 - row :: 2, column::2]) // 2
@@ -84,6 +84,7 @@ def _of_cells(raw: NDArray[np.uint8], row: int, column: int) -> Image:
 
 
 def _decode(stream: BinaryIO, source: str) -> Image:
+    """Pixels (H, W, 3), RGB uint8, of an encoded image; raises InputError naming `source` if it is damaged or too large."""
     with _open_image(stream, source) as image:
         if image.width * image.height > _MOST:
             raise InputError(f"{source}: {image.width} x {image.height} pixels are too many for an image of a camera")
@@ -96,6 +97,7 @@ def _decode(stream: BinaryIO, source: str) -> Image:
 
 
 def _open_image(stream: BinaryIO, source: str) -> Any:
+    """Open an encoded image by Pillow, without decoding it. Raises InputError naming `source`."""
     with importing("Pillow", _WAY_OUT):
         import PIL
         from PIL import Image as Pillow
@@ -107,10 +109,10 @@ def _open_image(stream: BinaryIO, source: str) -> Any:
 
 
 def write_geotiff(path: Path, image: NDArray[np.uint8], transform: Floats, epsg: int | None, nodata: int) -> None:
-    """Write a grey image (H, W) with a place in coordinates of GIS as deflated GeoTIFF 1.1, atomically. Raises OutputError.
+    """Write a grey image (H, W) with its georeference as deflated GeoTIFF 1.1, atomically. Raises OutputError.
 
     transform : (2, 3) from column and row, whose whole numbers are corners of pixels, to easting and northing, m
-    epsg : code of the coordinate reference system, None for local coordinates; nodata : value of pixels without one
+    epsg : code of the coordinate reference system, None for local coordinates; nodata : value of pixels without data
     """
     with importing("Pillow", _WAY_OUT):
         from PIL import Image as Pillow

@@ -117,6 +117,7 @@ def read_oxts(folder: Path) -> Oxts | None:
 
 
 def _read_sample(path: Path) -> Floats:
+    """The 30 numbers of an OXTS packet; raises InputError for anything else, or an impossible position."""
     try:
         words = path.read_text(encoding="utf-8").split()
         values = np.array([float(w) for w in words], np.float64)
@@ -196,7 +197,7 @@ def read_cam0_lidar(path: str | Path) -> Floats:
 
 
 def read_entries(path: Path) -> dict[str, str]:
-    """`name: values` lines of a calibration file."""
+    """Texts of the lines `name: values` of a calibration file, by name. Raises InputError if it is missing or empty."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except FileNotFoundError:
@@ -227,6 +228,7 @@ def _tr(path: Path, entries: dict[str, str]) -> Floats | None:
 
 
 def _entry(path: Path, entries: dict[str, str], name: str, count: int) -> Floats:
+    """The `count` numbers of the entry `name`; raises InputError naming the calibration `path` if they are not there."""
     if name not in entries:
         raise InputError(f"calibration {path} has no entry {name}: entries are {', '.join(entries)}")
     values = _numbers(entries[name].split())
@@ -317,6 +319,7 @@ def _numbers(words: list[str]) -> list[float] | None:
 
 
 def _transform(values: list[float]) -> Floats:
+    """(4, 4) transform of 12 or 16 numbers, rows of the matrix, or 7, tx ty tz qx qy qz qw; raises ValueError for others."""
     if not np.isfinite(values).all():
         raise ValueError("NaN or infinity")
     if len(values) == 7:

@@ -246,6 +246,7 @@ class LasCloud:
                 yield CloudBlock(points, np.asarray(block.intensity, np.float32), columns)
 
     def _column(self, block: Any, name: str, kind: np.dtype[Any]) -> NDArray[Any]:
+        """Values of the column `name`, of type `kind`, from a block of laspy; times are ns."""
         if name == TIME_NS:
             seconds = np.asarray(block["gps_time"], np.float64)
             return unix_time_ns(seconds) if self.is_unix else np.rint(1e9 * seconds).astype(np.int64)
@@ -268,7 +269,7 @@ def open_las(path: Path, attributes: Collection[str]) -> LasCloud:
 
 @contextmanager
 def _open_reader(path: Path) -> Iterator[tuple[Any, int]]:
-    """A reader of laspy, and how many points it may decompress at a time. Raises InputError for whatever goes wrong inside."""
+    """Context of a laspy reader and the number of points it may decompress at once. Errors inside become InputError."""
     with importing("laspy", _WAY_OUT):
         import laspy
         import lazrs  # noqa: F401
@@ -308,6 +309,7 @@ def _fields(columns: Columns, is_unix: bool) -> dict[str, NDArray[Any]]:
 
 
 def _header(laspy: Any, offset: Floats, wkt: str, types: Mapping[str, np.dtype[Any]], is_unix: bool) -> Any:
+    """laspy header for points of these column types; offset : (3,) m."""
     header = laspy.LasHeader(version="1.4", point_format=7 if set(_COLOURS) & set(types) else 6)
     own = _fields({name: np.zeros(0, kind) for name, kind in types.items()}, is_unix)
     known = set(header.point_format.dimension_names)

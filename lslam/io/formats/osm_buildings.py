@@ -66,8 +66,8 @@ def some_buildings_of(data: OsmData, origin: NDArray[Any], path: Path) -> Buildi
 def buildings_of(data: OsmData, origin: NDArray[Any], source: str = "the extract") -> BuildingExtract:
     """Footprints of every building in `data`, by the rules of docs/conventions.md ("Geodesy and OpenStreetMap").
 
-    Closed ways and multipolygons count; `building=no`, what lies underground and what misses nodes does not.
-    Raises InputError when all nodes lie more than 100 km from the origin, where a local frame means nothing.
+    Closed ways and multipolygons count, except `building=no`, underground buildings and those with missing nodes.
+    Raises InputError when all nodes lie more than 100 km from the origin, where a local frame is invalid.
     """
     at = np.asarray(origin, np.float64)
     where = _Positions(data, at)
@@ -98,7 +98,7 @@ def buildings_of(data: OsmData, origin: NDArray[Any], source: str = "the extract
 
 
 def middle_of(data: OsmData) -> Floats:
-    """(3,) lat, lon (deg) of the middle of the box round all buildings' nodes, as --origin takes them; height 0."""
+    """(3,) lat, lon (deg) of the centre of the box round all buildings' nodes, for --origin; height 0."""
     ways = [way for way in data.ways.values() if "building" in way.tags]
     members = {m.ref for r in data.relations.values() if "building" in r.tags for m in r.members if m.kind == "way"}
     ways += [way for number, way in data.ways.items() if number in members]
@@ -144,6 +144,7 @@ def _counts(tags: Mapping[str, str], omissions: Counter[str]) -> bool:
 
 
 def _way_footprints(way: Way, where: _Positions, omissions: Counter[str]) -> tuple[Footprint, ...]:
+    """Footprints of a closed way; empty, with a count in `omissions`, if it is open, has missing nodes or no area."""
     if not where.has(way.nodes) or not way.nodes:
         omissions["nodes missing"] += 1
     elif not way.is_ring:
@@ -158,6 +159,7 @@ def _way_footprints(way: Way, where: _Positions, omissions: Counter[str]) -> tup
 def _relation_footprints(
     relation: Relation, data: OsmData, where: _Positions, omissions: Counter[str]
 ) -> tuple[Footprint, ...]:
+    """Footprints of a multipolygon; empty, with a count in `omissions`, if rings do not close, nodes are missing or no area."""
     members = [m for m in relation.members if m.kind == "way" and m.role in ("", "outer", "inner")]
     ways = [data.ways.get(m.ref) for m in members]
     if not all(way is not None and way.nodes and where.has(way.nodes) for way in ways):
@@ -185,7 +187,7 @@ def _has_swapped_axes(data: OsmData, origin: Floats) -> bool:
 
 
 def right_place(origin: Floats, has_swapped_axes: bool = False) -> str:
-    """Advice for a message about an extract of another place."""
+    """Advice for a message about an extract far from the origin: check it, or swap latitude and longitude."""
     if has_swapped_axes:
         return (
             f"latitude and longitude are swapped, in --origin ({origin[0]:.5f},{origin[1]:.5f}; latitude first) or in the file "
@@ -260,9 +262,9 @@ def join_rings(parts: Sequence[NodeIds]) -> list[NodeIds] | None:
 
 
 def footprints_from_rings(outers: Sequence[Floats], inners: Sequence[Floats]) -> tuple[Footprint, ...]:
-    """Footprints of the outlines (K, 2), m, minus the inner rings; corners stay as they are wherever the rings are valid.
+    """Footprints of the outlines (K, 2), m, minus the inner rings; the corners of valid rings are unchanged.
 
-    Rings that cross themselves or each other are repaired (shapely's make_valid); nothing is left of rings without area.
+    Rings that cross themselves or each other are repaired (shapely's make_valid); rings without area vanish.
     """
     from shapely import make_valid, union_all
 

@@ -54,8 +54,8 @@ class Relation:
 class OsmData:
     """An extract: nodes as (lat, lon) in deg, ways and relations by number.
 
-    attribution : the words every output made from it must carry; None for a simulated place, which nobody surveyed
-    versions : by (kind, number), of elements that were edited before, which the database asks for; all others have 1
+    attribution : the credit that every output made from it must carry; None for a simulated place
+    versions : by (kind, number), of elements that were edited before, which the database requires; all others have 1
     edits : (kind, number) of elements that differ from the database, as JOSM marks them in its files
     """
 
@@ -140,8 +140,8 @@ class OsmData:
 class AreaMaker:
     """Adds areas to `data`: one outline without holes is a way, all else a multipolygon.
 
-    Nodes, and whatever has no number of its own, get numbers below zero, which no element of OpenStreetMap has, and none of
-    those `numbers`. Where `shares_nodes`, corners at one place are one node.
+    Nodes, and elements without a number, get negative numbers, which no element of OpenStreetMap has, and none of
+    those `numbers`. With `shares_nodes`, corners at the same position are one node.
     """
 
     def __init__(self, data: OsmData, numbers: Collection[int], shares_nodes: bool) -> None:
@@ -174,6 +174,7 @@ class AreaMaker:
         self._data.add_relation(Relation(number, members, tags_of_relation))
 
     def _way(self, ring: Iterable[Place], number: int | None, tags: Mapping[str, str]) -> int:
+        """Add a closed way of the ring; returns its number, a new negative one if `number` is None."""
         if number is None:
             number = next(self._numbers)
         nodes = [self._node(place) for place in ring]

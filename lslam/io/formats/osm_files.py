@@ -85,6 +85,7 @@ def write_osm(path: Path, data: OsmData) -> None:
 
 
 def _read_json(path: Path) -> OsmData:
+    """Read an Overpass reply or GeoJSON; raises InputError if it is broken or unusable."""
     data = OsmData()
     try:
         with path.open("rb") as stream:
@@ -102,6 +103,7 @@ def _read_json(path: Path) -> OsmData:
 
 
 def _read_xml(path: Path, is_wide: bool) -> OsmData:
+    """Read OSM XML; is_wide : it is in UTF-16. Raises InputError if it is broken, no OSM file, or declares entities."""
     from defusedxml import DefusedXmlException, DTDForbidden
 
     try:
@@ -144,6 +146,7 @@ def _parsed_xml(path: Path, stream: IO[Any]) -> OsmData:
 
 
 def _add_xml(data: OsmData, element: Element) -> None:
+    """Add a node, way or relation of OSM XML to `data`; deleted and invisible ones are skipped."""
     # JOSM marks deletions, the history API hides old versions: neither is on the ground.
     if element.get("action") == "delete" or element.get("visible") == "false":
         return
@@ -165,6 +168,7 @@ def _add_xml(data: OsmData, element: Element) -> None:
 
 
 def _xml_lines(data: OsmData) -> Iterator[str]:
+    """Lines of an OSM XML file with all elements of `data`."""
     yield "<?xml version='1.0' encoding='UTF-8'?>\n"
     credit = f" attribution={quoteattr(data.attribution)}" if data.attribution else ""
     yield f'<osm version="0.6" generator="{GENERATOR}"{credit}>\n'
@@ -210,9 +214,9 @@ def is_geojson(tree: Any) -> bool:
 def osm_from_outlines(tree: Any) -> OsmData:
     """The polygons of a parsed GeoJSON document as ways and multipolygons.
 
-    Properties are tags, `@id` or `osm_id` keeps the element's number (`way/12`); others get negative numbers. In a file
-    whose properties never say `building` every polygon is one. Raises ValueError for another coordinate system, and for
-    polygons that are none.
+    Properties become tags, `@id` or `osm_id` the element's number (`way/12`); others get negative numbers. In a file
+    whose properties never have `building`, every polygon is a building. Raises ValueError for another coordinate system, and for
+    malformed polygons.
     """
     if (crs := tree.get("crs")) and not _WGS84.search(str(crs)):
         raise ValueError(f"its coordinates are in {str(crs)[:80]}: {_REPROJECT}")
@@ -236,6 +240,7 @@ def _places(ring: Any) -> list[Place]:
 
 
 def _place(position: Any) -> Place:
+    """(lat, lon), deg, of a GeoJSON position; raises ValueError for anything else, with advice on swapped axes."""
     try:
         lon, lat = float(position[0]), float(position[1])
     except (TypeError, ValueError, IndexError, KeyError):

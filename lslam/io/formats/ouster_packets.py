@@ -104,7 +104,7 @@ def read_metadata(path: Path) -> OusterSensor:
 
 
 def parse_metadata(text: str | bytes, where: str) -> OusterSensor:
-    """As `read_metadata`, from text; `where` names its source in messages."""
+    """Parse metadata as `read_metadata`, from text; `where` names its source in messages. Raises InputError."""
     try:
         entries = _flat(parse_json(text))
     except MISFIT as error:
@@ -132,6 +132,7 @@ def _flat(tree: Any) -> dict[str, Any]:
 
 
 def _sensor(entries: dict[str, Any], layout: str) -> OusterSensor:
+    """Sensor by the flattened metadata `entries` and the packet profile `layout`; raises ValueError or KeyError if they misfit."""
     width, rate = (int(word) for word in str(entries["lidar_mode"]).split("x"))
     width, columns = int(entries.get("columns_per_frame") or width), int(entries.get("columns_per_packet") or 16)
     altitudes, azimuths = (

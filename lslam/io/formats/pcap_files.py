@@ -39,9 +39,9 @@ _CUT = (EOFError, struct.error)
 class Datagrams:
     """UDP datagrams of a capture in the order of their first fragments; their bytes stay on disk.
 
-    data : the file, uint8; stamps_ns : (N,) when each was captured; sizes : (N,) bytes of payload
+    data : the file, uint8; stamps_ns : (N,) time of capture; sizes : (N,) bytes of payload
     sources : (N,) IPv4 address and port of the sender as one number
-    first, count : (N,) which rows of `begin` and `length` (M,) are its pieces
+    first, count : (N,) first row and number of rows of its pieces in `begin` and `length` (M,)
     loss : a sentence about missing data, empty if nothing is missing
     """
 
@@ -114,7 +114,7 @@ def _frames(path: Path, data: memoryview) -> tuple[Longs, str]:
 
 
 def _walk_pcap(data: memoryview, order: str, unit_ns: int) -> Iterator[tuple[int, int, int, int]]:
-    """Rows of `_frames`; raises one of `_CUT` where the file ends within a record."""
+    """Frames of a pcap file as rows of `_frames`; raises one of `_CUT` where the file ends within a record."""
     link = struct.unpack_from(order + "I", data, 20)[0] & 0xFFFF
     record = struct.Struct(order + "IIII")
     at, end = 24, len(data)
@@ -128,7 +128,7 @@ def _walk_pcap(data: memoryview, order: str, unit_ns: int) -> Iterator[tuple[int
 
 
 def _walk_pcapng(data: memoryview) -> Iterator[tuple[int, int, int, int]]:
-    """As `_walk_pcap`; blocks that are no packets are skipped."""
+    """Frames of a pcapng file as rows of `_frames`; other blocks are skipped. Raises one of `_CUT` at a truncated block."""
     at, end, order = 0, len(data), "<"
     interfaces: list[tuple[int, int]] = []
     while at < end:

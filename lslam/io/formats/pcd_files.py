@@ -80,6 +80,7 @@ def packed_colour(columns: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]
 
 
 def _read_header(path: Path, data: bytes) -> _Header:
+    """Parse the header of a PCD file; raises InputError naming the line."""
     entries: dict[str, list[str]] = {}
     stream = io.BytesIO(data)
     number = 0
@@ -98,6 +99,7 @@ def _read_header(path: Path, data: bytes) -> _Header:
 
 
 def _check_header(path: Path, entries: dict[str, list[str]], size: int) -> _Header:
+    """Header of the parsed entries, `size` bytes long; raises InputError where they contradict each other."""
     names = entries.get("FIELDS", [])
     sizes, types = entries.get("SIZE", []), entries.get("TYPE", [])
     repeats = entries.get("COUNT", ["1"] * len(names))
@@ -142,6 +144,7 @@ def _number(path: Path, key: str, *words: str) -> int:
 
 
 def _ascii_columns(path: Path, header: _Header, body: memoryview) -> dict[str, NDArray[Any]]:
+    """Columns by name of ASCII data; raises InputError for too few lines or unreadable numbers."""
     width = sum(math.prod(kind.shape) for kind in header.kinds)
     lines = bytes(body).split(b"\n")
     while lines and not lines[-1].strip():
@@ -166,10 +169,10 @@ def _ascii_columns(path: Path, header: _Header, body: memoryview) -> dict[str, N
 
 
 def _rows_with_raw_bytes(header: _Header, body: bytes) -> tuple[Floats, set[int]] | None:
-    """Numbers of ASCII lines in which columns hold raw bytes in place of digits, among them blanks and line ends.
+    """Numbers of ASCII lines in which columns have raw bytes in place of digits, among them blanks and line ends.
 
-    C++ streams write a char so. Columns of one byte are therefore read as raw bytes. Other such columns become NaN, and are
-    named.
+    C++ streams write a char so. Columns of one byte are therefore read as raw bytes. Other such columns become NaN, and their
+    indices are returned. None if no such reading fits.
     """
     counts = [math.prod(kind.shape) for kind in header.kinds]
     if 2 * sum(counts) * header.points > len(body) + 1:
@@ -201,6 +204,7 @@ def _matches(line: re.Pattern[bytes], body: bytes, count: int) -> list[tuple[byt
 
 
 def _compressed_columns(path: Path, header: _Header, body: memoryview) -> dict[str, NDArray[Any]]:
+    """Columns by name of binary_compressed data (LZF); raises InputError for damaged data."""
     if len(body) < 8:
         raise InputError(f"{path}: PCD compressed data end before their two sizes")
     packed, plain = struct.unpack("<II", body[:8])

@@ -45,9 +45,9 @@ class _Element:
 
 
 def ply_columns(path: Path, data: bytes | mmap | None = None) -> dict[str, NDArray[Any]]:
-    """The vertices of a PLY file by property, without faces behind them. Raises InputError naming the file and the line.
+    """The vertices of a PLY file by property; other elements are ignored. Raises InputError naming the file and the line.
 
-    data : its content where that is known; columns of a binary file that is mapped are mapped, too
+    data : its content if already read; columns of a mapped binary file are mapped, too
     """
     if data is None:
         with input_errors(path):
@@ -95,6 +95,7 @@ def ply_header(count: int, kind: np.dtype[Any], comment: str = "") -> bytes:
 
 
 def _read_header(path: Path, data: bytes | mmap) -> tuple[str, list[_Element], int]:
+    """Encoding, elements and size in bytes of a PLY header; raises InputError naming the line."""
     if data[:4] not in (b"ply\n", b"ply\r"):
         raise InputError(f"{path}: no PLY file, its first line is not 'ply'")
     encoding, elements, position, number = "", list[_Element](), 0, 0
@@ -127,6 +128,7 @@ def _read_header(path: Path, data: bytes | mmap) -> tuple[str, list[_Element], i
 def _ascii_columns(
     path: Path, element: _Element, body: memoryview, start: int, is_last: bool
 ) -> dict[str, NDArray[Any]]:
+    """Columns by property of `element`, `start` lines behind the header; raises InputError for too few or bad lines."""
     every = [line for line in bytes(body).split(b"\n") if line.strip()][start:]
     lines = every[: element.count]
     if len(lines) < element.count:

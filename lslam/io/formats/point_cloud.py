@@ -141,9 +141,9 @@ class PointCloud:
     """Content of a point file.
 
     points : (N, 3) float32 (of maps float64), m; intensity : (N,) float32 or None
-    rings : (N,) uint16, `NO_RING` where a point has none, or None
+    rings : (N,) uint16, `NO_RING` for points without one, or None
     labels : (N,) uint16, class of each point, or None
-    clocks : what may be per-point times, the likeliest first; fields : those read as the above; unread : the others
+    clocks : candidates for per-point times, the likeliest first; fields : names of the fields used; unread : of all others
     """
 
     points: NDArray[Any]
@@ -280,7 +280,7 @@ def _first(names: Mapping[str, str], plain_names: tuple[str, ...]) -> str | None
 def _find_rings(
     points: NDArray[np.float32], candidates: Mapping[str, NDArray[Any]]
 ) -> tuple[str | None, NDArray[np.uint16] | None]:
-    """The first of the fields whose values can be rings; points that were not measured have no say."""
+    """Name and values of the first candidate field that can be rings; unmeasured points are not considered."""
     for name, values in candidates.items():
         if np.can_cast(values.dtype, np.uint16):
             rings = values.astype(np.uint16)

@@ -47,6 +47,7 @@ def read_points(path: Path, record: PointRecord | None = None) -> PointCloud:
 
 
 def _read_columns(path: Path, record: PointRecord | None = None) -> Mapping[str, NDArray[Any]]:
+    """Columns of a point file by name; record : of `.bin` and `.npy` files, None to detect it. Raises InputError."""
     suffix = path.suffix.lower()
     if suffix == ".bin":
         raw = read_bytes(path)
@@ -82,7 +83,7 @@ def check_size(path: Path, raw: NDArray[np.uint8], record: PointRecord) -> None:
 def record_of(files: Mapping[Path, NDArray[np.uint8]]) -> tuple[PointRecord, str]:
     """Detect the point record of `.bin` files by their values.
 
-    The second result says why it is not KITTI's; it is empty if it is.
+    The second result is the reason why it is not KITTI's; it is empty if it is.
 
     Raises InputError with the sizes that would fit when no record fits or several do.
     """
@@ -133,7 +134,7 @@ def write_labels(path: Path, labels: NDArray[np.uint16]) -> None:
 
 
 def read_array(path: Path) -> NDArray[Any]:
-    """An array of points: structured and flat, or numbers (N, K). Raises InputError when it is something else."""
+    """An array of points: structured and flat, or numbers (N, K). Raises InputError for anything else."""
     kinds = (*MISFIT, EOFError, SyntaxError, MemoryError, TokenError)
     with input_errors(path, *kinds, as_what="a NumPy array"), HEADERS, path.open("rb") as stream:
         table = np.lib.format.read_array(stream, allow_pickle=False)
@@ -150,6 +151,7 @@ def read_array(path: Path) -> NDArray[Any]:
 
 
 def _npy_columns(path: Path, record: PointRecord | None) -> Mapping[str, NDArray[Any]]:
+    """Columns by name of a NumPy file, named by `record`, by its own fields, or by their values."""
     table = read_array(path)
     if table.dtype.names:
         return _of_structure(table)
@@ -184,7 +186,7 @@ _COLUMNS = {".pcd": pcd_columns, ".ply": ply_columns, ".txt": _text_columns}
 
 
 def write_cloud(path: Path, cloud: Cloud, *, comment: str = "", wkt: str = "") -> None:
-    """Write a cloud, m, atomically and without holding it in memory: .ply and .pcd hold float32, .las and .laz millimetres.
+    """Write a cloud, m, atomically and block by block: .ply and .pcd store float32, .las and .laz millimetres.
 
     Further columns follow, `time` in s.
 
@@ -235,6 +237,7 @@ def _record_type(cloud: Cloud, pack: Callable[[Columns], Columns]) -> np.dtype[A
 
 
 def _records(block: CloudBlock, kind: np.dtype[Any], pack: Callable[[Columns], Columns]) -> NDArray[Any]:
+    """Structured array of the points of a block, of type `kind`; pack : converts the columns."""
     columns = pack(block.columns)
     values = {**dict(zip(AXES, block.points.T, strict=True)), "intensity": block.intensity, **columns}
     if TIME_NS in values:
@@ -246,7 +249,7 @@ def _records(block: CloudBlock, kind: np.dtype[Any], pack: Callable[[Columns], C
 
 
 def read_cloud(path: Path) -> ArrayCloud:
-    """Read any map or point file whole as float64, m; coordinates far from the origin in coarse steps are warned about.
+    """Read any map or point file whole as float64, m; warns of large coordinates with a coarse resolution.
 
     Raises InputError naming the file when it is missing, damaged or of another kind.
     """
@@ -289,7 +292,7 @@ def open_map(path: Path, attributes: Collection[str]) -> Cloud:
 
 
 def coordinate_step(points: Floats) -> float:
-    """Quantisation step of the coordinates, m: the largest of the axes; 0 for coordinates near the origin."""
+    """Quantisation step of the coordinates, m: the largest of the axes; 0 for small coordinates."""
     steps = [0.0]
     for column in points.T:
         values = np.unique(column[np.isfinite(column)])

@@ -131,8 +131,8 @@ def recognise(files: Sequence[NDArray[np.uint8]]) -> Recognition:
 def name_columns(tables: Sequence[NDArray[Any]]) -> tuple[str, ...]:
     """Names of the columns of arrays (N, K), x y z first, by their values in all of the arrays; `_` for those unknown.
 
-    A ring is a small whole number that goes with the elevation; times run through a sweep in the order of the points; the first
-    column of other values that are not negative is the intensity. Of four columns the last is the intensity where it is neither.
+    A ring is a small whole number that correlates with the elevation; times increase through a sweep in the order of the points;
+    the first column of other non-negative values is the intensity. The last of four columns is the intensity if it is neither.
     """
     scans = [_valid_rows(np.asarray(table, np.float64)) for table in tables]
     names = ["x", "y", "z"]
@@ -177,7 +177,7 @@ def _candidates(files: Sequence[NDArray[np.uint8]]) -> list[PointRecord]:
 
 
 def _faults(record: PointRecord, files: Sequence[NDArray[np.uint8]]) -> tuple[str, str] | None:
-    """Values that no measurement can have, and values that are only unlikely, in words; None where there are too few points."""
+    """Impossible values, and unlikely ones, each in words or empty; None for too few points to judge."""
     tables = _whole(record, files)
     if not tables:
         return f"{len(files[0])} bytes are no multiple of {record.size}", ""
@@ -188,6 +188,7 @@ def _faults(record: PointRecord, files: Sequence[NDArray[np.uint8]]) -> tuple[st
 
 
 def _impossible(record: PointRecord, scans: list[Floats]) -> str:
+    """Reason why the values of the scans cannot be measurements of the record, in words; empty if they can."""
     rows = np.concatenate(scans)
     columns = {name: k for k, name in enumerate(record.names)}
     floats = rows[:, ["f" in code for code in record.types]]
@@ -210,6 +211,7 @@ def _impossible(record: PointRecord, scans: list[Floats]) -> str:
 
 
 def _unlikely(scans: list[Floats]) -> str:
+    """Reason why the coordinates of the scans are implausible, in words; empty if they are not."""
     points = np.concatenate(scans)[:, :3]
     if np.mean(np.abs(points[:, 2]) > 6 * np.hypot(points[:, 0], points[:, 1])) > 0.2:
         return "a fifth of the points is straight above or below"
@@ -225,7 +227,7 @@ def _unlikely(scans: list[Floats]) -> str:
 
 
 def _depends_on_row(columns: list[Floats], period: int) -> bool:
-    """Whether every `period`-th value is of another kind: of another size, or of another sign."""
+    """Whether every `period`-th value differs from the others in magnitude or sign."""
     parts = [np.concatenate([column[k::period] for column in columns]) for k in range(period)]
     least = min(len(part) for part in parts)
     if least < _MIN_POINTS:

@@ -83,6 +83,7 @@ def _livox_body(start: int, is_ros1: bool) -> int:
 
 
 def _dtype(message: Any, where: Path) -> np.dtype[Any]:
+    """Structured type of the fields of a PointCloud2; raises InputError for a field beyond the point."""
     order = ">" if message.is_bigendian else "<"
     step = int(message.point_step)
     fields: dict[str, tuple[Any, int]] = {}

@@ -177,7 +177,7 @@ def read_sequence_toml(path: Path) -> SequenceInfo:
 
 
 def parse_sequence_toml(text: str, path: Path | str) -> SequenceInfo:
-    """As `read_sequence_toml`, from text; messages name `path`."""
+    """Parse the text of a `sequence.toml`; messages name `path`. Raises InputError for unknown keys and wrong values."""
     with input_errors(path, tomllib.TOMLDecodeError, as_what="TOML"):
         tree = parse_toml(text)
     tables = {key: tree.pop(key, {}) for key in _TABLES}
@@ -286,6 +286,7 @@ def _camera(path: Path | str, name: str, table: Any) -> CameraInfo:
 
 
 def _numbers(path: Path | str, key: str, value: Any, counts: tuple[int, ...], what: str) -> tuple[float, ...]:
+    """A tuple of one of the `counts` of finite numbers; raises InputError that expects `what`."""
     try:
         numbers = np.asarray(value, np.float64)
     except (TypeError, ValueError, OverflowError):

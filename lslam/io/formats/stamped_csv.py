@@ -38,8 +38,8 @@ def read_stamped_csv(
     """Stamps (N,) ns and values (N, K), one column per entry of `columns`, each entry its accepted names.
 
     Columns of `optional` follow and are NaN where the file has none. The header is the first line; a leading `#` or `%`,
-    units in brackets, case and what stands before the last points or slashes (`field.linear_acceleration.x`) do not count.
-    The time is one column or two (`time_columns`). What was chosen and left out goes to `notes`. Raises InputError naming file,
+    units in brackets, case and prefixes that end in a point or slash (`field.linear_acceleration.x`) are ignored.
+    The time is one column or two (`time_columns`). Decisions and omissions are added to `notes`. Raises InputError naming file,
     line and what is missing.
     """
     table = read_table(path)
@@ -144,7 +144,7 @@ def write_gnss_csv(path: Path, gnss: GnssStream) -> None:
 def read_wheels_csv(path: Path, wheelbase_m: float | None = None, notes: list[str] | None = None) -> WheelStream:
     """Read speeds of wheels, m/s: `stamp_ns` (or seconds), `speed`, or `left` and `right`, their mean; nothing is converted.
 
-    If known, the turn stands in `yaw_rate`, rad/s, or in `steering`, rad, of front wheels `wheelbase_m` before the axle, as of a
+    The yaw rate is in `yaw_rate`, rad/s, or follows from `steering`, rad, of front wheels `wheelbase_m` before the axle, by a
     kinematic bicycle. Raises InputError naming file and line, or what is missing.
     """
     either = [("speed", "v", "velocity", "linear_x", "speed_m_s"), ("left", "speed_left"), ("right", "speed_right")]

@@ -40,7 +40,7 @@ def write_npz(path: Path, arrays: Mapping[str, NDArray[Any]], level: int = 1) ->
 
 
 def pack_npz(stream: BinaryIO, arrays: Mapping[str, NDArray[Any]], level: int = 1) -> None:
-    """As `write_npz`, into an open stream."""
+    """Write arrays by name as .npz into an open stream; level : of compression, 0 for none. Equal arrays give equal bytes."""
     method = zipfile.ZIP_DEFLATED if level else zipfile.ZIP_STORED
     with zipfile.ZipFile(stream, "w", method, compresslevel=level or None) as archive:
         for name, array in arrays.items():
@@ -95,6 +95,7 @@ def read_state(path: Path, classes: Sequence[type]) -> Any:
 
 
 def _encode(value: Any, arrays: Arrays) -> Any:
+    """JSON tree of a value, with its arrays moved to `arrays`; raises TypeError for an unsupported type."""
     if value is None or isinstance(value, bool | int | float | str):
         return value
     if isinstance(value, np.ndarray | np.generic):
@@ -115,6 +116,7 @@ def _encode(value: Any, arrays: Arrays) -> Any:
 
 
 def _decode(tree: Any, arrays: Arrays, classes: Classes) -> Any:
+    """The value that `_encode` turned into `tree` and `arrays`; classes : dataclasses by name."""
     if not isinstance(tree, dict):
         return tree
     if "class" in tree:
@@ -172,6 +174,7 @@ def _encode_column(values: list[Any], arrays: Arrays) -> Any:
 
 
 def _decode_column(tree: Any, arrays: Arrays, classes: Classes) -> list[Any]:
+    """The values of one field of all records, by `_encode_column`."""
     inside = _decode(tree["inside"], arrays, classes)
     kind, present = tree["kind"], _decode(tree["present"], arrays, classes)
     known: list[Any]

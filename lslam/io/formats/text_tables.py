@@ -76,7 +76,7 @@ class TextTable:
         return values
 
     def lost_rows(self, values: Floats, what: str) -> Bools:
-        """(N,) whether `values` (N, K) of poses hold NaN; `what` names the values in messages.
+        """(N,) whether rows of pose `values` (N, K) have NaN; `what` names the values in messages.
 
         Raises InputError when all rows do, and naming the line of an infinite value.
         """
@@ -150,7 +150,7 @@ def separator_of(text: str) -> str | None:
 
 
 def split_cells(text: str, separator: str | None) -> list[str]:
-    """Cells of a line, without quotes; decimal commas become points where cells stand between something else.
+    """Cells of a line, without quotes; decimal commas become points unless the comma is the separator (None: blanks).
 
     >>> split_cells("1700000000,5; 2", ";"), split_cells("2011-09-26 13:04:32.5 7", None)
     (['1700000000.5', '2'], ['2011-09-26T13:04:32.5', '7'])
@@ -174,7 +174,7 @@ def _cells_of(text: str, separator: str | None) -> list[str]:
 
 
 def text_table(path: Path, rows: list[Row], comments: list[str]) -> TextTable:
-    """The table of the data lines and comments of a file; the names are those of the first line or of a comment as wide."""
+    """Table of a file's data lines and comments; names come from the first line, or from a comment with as many words."""
     first = header = rows[0].text if rows else ""
     if looks_like_header(header):
         rows = rows[1:]

@@ -93,10 +93,10 @@ def read_times(path: str | Path) -> Longs:
 def read_stamps(path: Path, must_increase: bool = False) -> Longs:
     """(N,) int64 ns of a text file, one stamp a line.
 
-    The time is in the column that a header names, else in the first one or two; an index before it and columns behind it
-    are left out. Seconds may be decimal or scientific (KITTI's times.txt), whole numbers of nanoseconds, or dates such as
+    The time is in the column that a header names, else in the first one or two; an index before it and columns after it
+    are ignored. Seconds may be decimal or scientific (KITTI's times.txt), whole numbers of nanoseconds, or dates such as
     `2011-09-26 13:04:32.349659964` (KITTI raw, taken as UTC), which keep all nine digits.
-    Raises InputError naming file and line.
+    must_increase : raise InputError for a stamp that does not increase. Raises InputError naming file and line.
     """
     rows, comments = read_rows(path)
     table = text_table(path, [Row(k, text) for k, line, _ in rows if (text := line.split("#")[0].strip())], comments)
@@ -138,10 +138,10 @@ def unread_columns(table: TextTable, columns: Collection[int]) -> list[str]:
 
 
 def unit_of_fraction(whole: Floats, rest: Floats, unit_ns: int | None = None) -> int | None:
-    """Nanoseconds in the unit in which `rest` (N,) is the fraction of the whole seconds `whole` (N,); None when it is none.
+    """Unit, ns, in which `rest` (N,) is the fraction of the whole seconds `whole` (N,); None when it is none.
 
-    unit_ns : that which the name of `rest` states. Without it, fractions are whole ns that reach beyond a million and do not
-    merely count; where the seconds repeat, decimals of a second, or whole ms or us, too. Rows without a number do not count.
+    unit_ns : unit by the name of `rest`. Without it, fractions are whole ns that exceed a million and are no
+    mere count; where the seconds repeat, also decimals of a second, or whole ms or us. Rows without a number are ignored.
     """
     both = np.isfinite(whole) & np.isfinite(rest)
     whole, rest = whole[both], rest[both]
@@ -171,6 +171,7 @@ def unit_ns_of(name: str) -> int | None:
 
 
 def _by_name(table: TextTable, other_columns: Collection[int]) -> list[Units]:
+    """Time columns by name, the likeliest first: units (ns or None) by column, two columns for seconds and fraction."""
     words = [tokens_of(name) for name in table.names]
     width = len(table.rows[0].cells) if table.rows else len(words)
     free = [k for k in range(min(len(words), width)) if k not in other_columns]
@@ -198,7 +199,10 @@ def _rank(words: list[str]) -> int | None:
 
 
 def _with_fraction(table: TextTable, words: list[list[str]], k: int, free: list[int]) -> Units:
-    """Column `k` and, if it has seconds, that of their fractions: of the same name but the unit, else the next column."""
+    """Unit, ns, of column `k` (None if unknown), and of the column with its fractions of a second, if there is one in `free`.
+
+    That column has the same name except for the unit, or is the next one; words : of all names.
+    """
     stated_ns = unit_ns_of(table.names[k])
     if stated_ns not in (None, SECOND_NS):
         return {k: stated_ns}
@@ -244,6 +248,7 @@ def _increases(values: Floats) -> bool:
 
 
 def _stamps(table: TextTable, units: Units, default_ns: int | None) -> Longs:
+    """(N,) ns, sum of the time columns in `units`; raises InputError naming the line of a cell that is no time."""
     out = np.zeros(len(table.rows), np.int64)
     for column, stated_ns in units.items():
         texts = [row.cells[column] if column < len(row.cells) else "" for row in table.rows]
@@ -260,10 +265,10 @@ def _stamps(table: TextTable, units: Units, default_ns: int | None) -> Longs:
 
 
 def unit_by_size(values: Floats, is_decimal: bool = False) -> int:
-    """Nanoseconds in one unit of a column of times (N,).
+    """Unit, ns, of a column of times (N,), by their size and step; is_decimal : written with a decimal point.
 
-    Times since 1970 have 10 digits in s, 13 in ms, 16 in us, 19 in ns. Other whole numbers that lie more than a minute apart
-    as seconds are in the unit in which they lie about 30 ms apart, unless they are written with a decimal point.
+    Times since 1970 have 10 digits in s, 13 in ms, 16 in us, 19 in ns. Other whole numbers more than a minute apart in
+    seconds have the unit in which their step is closest to 30 ms, unless they are written with a decimal point.
     """
     values = values[np.isfinite(values)]
     size = float(np.abs(values).max()) if len(values) else 0.0

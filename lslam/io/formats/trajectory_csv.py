@@ -132,11 +132,11 @@ def frame_in(comments: list[str]) -> str | None:
 
 
 def parse(table: TextTable, scalar: str = "", default_ns: int | None = None, frame: str = "unknown") -> Trajectory:
-    """Read a trajectory table by its column names, which may stand in a comment, else by the values in the columns.
+    """Read a trajectory table by its column names, from the header or a comment, else by the values in the columns.
 
-    scalar : place of w in quaternions without names, `first` or `last`; default_ns : unit of times without one
+    scalar : position of w in quaternions without names, `first` or `last`; default_ns : unit of times without one
     frame : the body, if no comment names another
-    Rows whose position or rotation is NaN or empty are lost poses and are left out.
+    Rows whose position or rotation is NaN or empty are dropped, with a note. Raises InputError.
     """
     path = table.path
     chosen = named_columns(table) if table.names else None
@@ -283,7 +283,7 @@ def _kind(words: list[str]) -> tuple[bool, Prefix, str] | None:
 def placed_columns(table: TextTable, scalar: str) -> PoseColumns:
     """The columns of a table without names: times, a position and, if there is one, a quaternion.
 
-    scalar : place of the quaternion's w, `first` or `last`, or empty where nothing says it
+    scalar : position of the quaternion's w, `first` or `last`, or empty if unknown
     Raises InputError when no layout fits, or several do.
     """
     width = len(table.rows[0].cells)

@@ -51,7 +51,7 @@ def _is_matrix(cells: list[str]) -> bool:
 
 
 def read_kitti(table: TextTable, times: Path | None) -> Trajectory:
-    """Read poses of camera 0, with the stamps of `times`, else of the times file that belongs to the poses."""
+    """Read poses of camera 0, with stamps from the file `times`, else from the times file that belongs to the poses."""
     trajectory = read_matrices(table)
     if not trajectory.has_stamps:
         stamps_ns = _stamps_of_kitti(table.path, scans_of(trajectory), times)
@@ -75,7 +75,7 @@ def drop_lost_poses(trajectory: Trajectory) -> Trajectory:
 
 
 def read_matrices(table: TextTable) -> Trajectory:
-    """The poses of rows of 12 or 16 numbers, row-major, perhaps behind a number of the scan (KITTI-360) or a time.
+    """Poses from rows of 12 or 16 numbers, row-major, perhaps after a scan number (KITTI-360) or a time.
 
     Lost poses are NaN. Without times the stamps count the scans at 10 Hz.
     Raises InputError naming the line that is short, no number, infinite, or no rotation.

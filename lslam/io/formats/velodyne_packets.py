@@ -93,9 +93,9 @@ class Blocks:
 
 
 def split_blocks(packets: NDArray[np.uint8], azimuth: Longs, times_ns: Longs, model: VelodyneModel) -> Blocks:
-    """Blocks of `packets` (P, 1206), whose first ones have these unwrapped azimuths and times, (P,).
+    """Blocks of `packets` (P, 1206); azimuth, times_ns : (P,) unwrapped azimuth and time of each packet's first block.
 
-    Of two returns the last is taken, the first of each pair of blocks.
+    With two returns per shot only the last is used, the first of each pair of blocks.
     """
     step = 2 if len(packets) and packets[0, 1204] == DUAL else 1
     body = packets[:, : BLOCKS * BLOCK_BYTES].reshape(-1, BLOCKS, BLOCK_BYTES)[:, ::step]

@@ -64,19 +64,19 @@ def open_sequence(
     ----------
     name_or_path : a folder, a bag, or a name looked up under `data_root` (or LSLAM_DATA): `seq07`, `07`, a raw drive
     rows, cols : organised clouds: point r * cols + c is of ring r
-    rate_hz : nominal scan rate, where stamps are missing
+    rate_hz : nominal scan rate, if stamps are missing
     motion_compensated : whether scans are free of motion distortion
     vertical_correction_deg : rotation of every point about p x z; None leaves it to the reader
-    lidar_topic, imu_topic, gnss_topic : which topics of a bag are read, where it has several
+    lidar_topic, imu_topic, gnss_topic : topics of a bag to read, if it has several
     lidar_frame : which of the LiDARs that share a topic, by the frame of their messages, or `all`
-    point_times : what tells the times of points: field, columns, order, azimuth or none; None and auto find out
+    point_times : source of the times of points: field, columns, order, azimuth or none; None and auto find out
     extrinsics : T_lidar_imu, as numbers or a file (see `read_transform`)
-        What is given wins over `sequence.toml`, which wins over what the layout implies.
+     Arguments override `sequence.toml`, which overrides the defaults of the layout.
     imu, gnss : whether the stream is needed: if the recording has none, it is searched elsewhere, as in KITTI's raw drive
 
     Raises
     ------
-    InputError naming where it looked and what is wrong; UsageError for values that make no sense.
+    InputError naming the places searched and the fault; UsageError for invalid values.
     """
     if (rows is None) != (cols is None) or min(rows or 1, cols or 1) < 1:
         raise UsageError(f"rows {rows} and cols {cols} of organised clouds go together and are above 0")
@@ -145,6 +145,7 @@ def _merge_lidars(sequence: Sequence, overrides: SequenceInfo) -> Sequence:
 
 
 def _open(folder: Path, overrides: SequenceInfo) -> Sequence:
+    """Open `folder` by the first reader, built-in or plug-in, that accepts it; raises InputError if none does."""
     has_recording = holds_recording(folder)
     for kind, dotted in READERS.items():
         if kind in ("bag", "pcap") and not has_recording:  # their modules are many
@@ -172,6 +173,7 @@ def _opened_by(reader: Any, folder: Path, overrides: SequenceInfo) -> Sequence |
 
 
 def _nothing_in(folder: Path) -> str:
+    """Message for a folder without a recording, with its content."""
     inside = sorted(p.name for p in folder.iterdir())
     if not inside:
         return f"{folder} is empty: there is no sequence in it"
@@ -187,7 +189,7 @@ def find_folder(name_or_path: str | Path, data_root: Path | None = None) -> Path
 
     `data_root` is LSLAM_DATA when None; the current folder comes after it. `seq07`, `07` and `kitti/07` find `sequences/07`
     and folders of those names; a drive is found by its name, by `drive_0005` or `0005` when only one has it.
-    Raises InputError naming where it looked and names that are near.
+    Raises InputError naming the places searched and similar names.
     """
     text = str(name_or_path)
     path = as_path(name_or_path).expanduser()
@@ -249,6 +251,7 @@ def _sequences(root: Path, text: str) -> list[Path]:
 
 
 def _drives(root: Path, text: str) -> list[Path]:
+    """KITTI raw drives below `root` that match a whole or partial name."""
     wanted = _DRIVE_NAME.match(text.rsplit("/", 1)[-1])
     if not wanted:
         return []
@@ -268,6 +271,7 @@ def _all_drives(root: Path) -> list[Path]:
 
 
 def _no_sequence(text: str, root: Path) -> str:
+    """Message for a name that no sequence below `root` has, with similar names."""
     sequences = [p for part in _ROOTS for p in (root / part / "sequences").glob("*/")]
     folders = [p.name for p in root.glob("*/") if p.name not in ("sequences", "poses")]
     names = sorted({*(f"seq{p.name}" for p in sequences), *(p.name for p in _all_drives(root)), *folders})

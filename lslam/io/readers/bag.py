@@ -66,7 +66,7 @@ _TRUTH = re.compile(r"(^|[/_])(ground_?truth|gt)([/_]|$)", re.IGNORECASE)
 class BagSequence(SequenceOnDisk):
     """A recording in a bag.
 
-    messages : (N,) int64, which message of `topic` each scan is; headers_ns : (N,) int64, stamps of their headers
+    messages : (N,) int64, index of each scan's message in `topic`; headers_ns : (N,) int64, stamps of their headers
     uses : purpose of each topic in use; halves : further messages of a scan
     revolutions : set for packets, and then read in place of messages
     """
@@ -85,6 +85,7 @@ class BagSequence(SequenceOnDisk):
         return self.topic.stamps_ns[self.messages]
 
     def _read(self, index: int) -> Scan:
+        """Read scan `index`, with point times by the recording's clock. Raises InputError if it is damaged."""
         if self.revolutions is not None:
             return read_scan(self.revolutions, index, not self.motion_compensated)
         stamp = int(self.headers_ns[index])
@@ -146,9 +147,9 @@ def _others(path: Path) -> str:
 
 
 def open_folder(path: Path, overrides: SequenceInfo, why: str) -> Sequence:
-    """Open the bag file, or the folder of them, at `path`; several LiDARs that are asked for become one sequence.
+    """Open the bag file, or the folder of them, at `path`; several requested LiDARs are merged into one sequence.
 
-    Raises InputError when it is unreadable, holds no clouds, or does not say where a LiDAR to be merged sits, UsageError for
+    Raises InputError when it is unreadable, has no clouds, or lacks the extrinsics of a LiDAR to be merged, UsageError for
     topics that are ambiguous or do not exist.
     """
     bag = open_bag(path)
@@ -197,7 +198,10 @@ def open_folder(path: Path, overrides: SequenceInfo, why: str) -> Sequence:
 
 
 def _lidars_of(bag: Bag, topic: BagTopic, info: SequenceInfo, voice: Voice, has_leading: bool) -> list[_Lidar]:
-    """LiDARs of a topic that are read. What `info` states about the sensor applies to the leading one."""
+    """The chosen LiDARs of a topic: index, scans and, for packets, sensor. `info` applies to the leading one only.
+
+    has_leading : whether an earlier topic has the leading LiDAR
+    """
     if can_decode(topic):
         turns, frame = open_packets(bag, topic, voice)
         stamps = turns.revolutions.stamps_ns
@@ -278,7 +282,7 @@ def _info(path: Path, bag: Bag, overrides: SequenceInfo) -> SequenceInfo:
 
 
 def _open_clock(sequence: BagSequence, info: SequenceInfo) -> None:
-    """Learn on a few scans how per-point times are encoded, and move the stamps to the scans' starts."""
+    """Learn the encoding of per-point times from a few scans, and move the stamps to the scans' starts."""
 
     def sample(index: int) -> Sample:
         cloud, shift = sequence.cloud(index)
@@ -311,7 +315,7 @@ def _open_clock(sequence: BagSequence, info: SequenceInfo) -> None:
 def find_extrinsics(
     links: Links, lidar: str, imu: Stream | None, gnss: Stream | None, info: SequenceInfo, voice: Voice
 ) -> tuple[Calibration, bool]:
-    """Extrinsics as stated, else by the bag's transforms, else the identity, with a warning and True.
+    """Extrinsics by `info`, else by the bag's transforms, else the identity for the IMU, with a problem; and whether assumed.
 
     lidar : the frame of the scans
     """
@@ -344,7 +348,7 @@ def truth_topics(bag: Bag) -> list[BagTopic]:
 
 
 def find_truth(sequence: BagSequence, links: Links, lidar: str, voice: Voice) -> Trajectory | None:
-    """LiDAR poses of the first topic whose name says ground truth (Odometry or PoseStamped), None when there is none."""
+    """LiDAR poses from the first topic named as ground truth (Odometry or PoseStamped), None when there is none."""
     bag = sequence.bag
     topics = truth_topics(bag)
     if not topics:

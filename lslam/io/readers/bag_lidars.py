@@ -70,9 +70,9 @@ def name_lidars(frames: Sequence[str], ids: Sequence[int | None]) -> list[str]:
 
 
 def choose_lidars(topic: BagTopic, names: Sequence[str], choice: str | None, voice: Voice) -> list[tuple[str, Bools]]:
-    """LiDARs of a topic that are read, the leading one first: their names, and (N,) bool which messages are theirs.
+    """LiDARs of a topic to read, the leading one first: their names, and (N,) bool, the messages of each.
 
-    names : (N,) of the sensor of each message; choice : names with commas between them, `all`, or None
+    names : (N,) of the sensor of each message; choice : names separated by commas, `all`, or None
 
     If `choice` is None the LiDAR with the most messages is read, and the others are named in the problems. A name that
     replaces another in the middle of the recording is the same LiDAR. Raises UsageError for names that the topic does not
@@ -148,7 +148,7 @@ def put_together(bag: Bag, topic: BagTopic, group: tuple[int, ...]) -> tuple[Poi
 def find_halves(bag: Bag, topic: BagTopic, messages: Stamps, stamps: Stamps, frames: list[str], voice: Voice) -> Halves:
     """Find further parts of scans among `messages` (N,), by their stamps (N,) and frames; notes go to `voice`.
 
-    With many stamps only a sample is checked. A message that turns out to be no part is left out when the scan is read.
+    Of many stamps only a sample is checked. A message that turns out to be no part is dropped when the scan is read.
     """
     by_stamp: dict[tuple[int, str], list[int]] = {}
     for message, stamp, frame in zip(messages.tolist(), stamps.tolist(), frames, strict=True):
@@ -209,7 +209,7 @@ def _shift_times(cloud: PointCloud, later_ns: int) -> PointCloud:
 
 
 def _is_complement(a: PointCloud, b: PointCloud) -> bool:
-    """Whether b covers other azimuths or rings than a, or, for a sensor that does not turn, other times."""
+    """Whether b covers other azimuths or rings than a or, for a sensor with a limited view, other times."""
     of_a, of_b = _azimuths(a), _azimuths(b)
     if np.minimum(of_a, of_b).sum() <= _MOST_OVERLAP * min(of_a.sum(), of_b.sum()):
         return True
@@ -240,9 +240,9 @@ def _when(times: NDArray[Any]) -> tuple[float, float, float]:
 
 @dataclass
 class Links:
-    """Transforms between frames; /tf is read when /tf_static does not lead from one to the other.
+    """Transforms between frames; /tf is read when /tf_static does not connect the two.
 
-    static : of /tf_static; uses_tf : whether a chain went over /tf
+    static : of /tf_static; uses_tf : whether a chain used /tf
     """
 
     bag: Bag
@@ -304,6 +304,7 @@ class Links:
         return {**same, **self.static}
 
     def _read(self, wants_static: bool, most: int | None = None) -> Transforms:
+        """Transforms of the static or the dynamic topics, from their first `most` messages (None: all)."""
         problems = self.voice.problems if most is None else []
         poses_of: dict[tuple[str, str], list[Floats]] = {}
         for topic in self.bag.of_type("TFMessage"):

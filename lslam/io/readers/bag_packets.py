@@ -59,9 +59,9 @@ class BagPackets:
 
 
 def open_packets(bag: Bag, topic: BagTopic, voice: Voice) -> tuple[SpinningSensor, str]:
-    """The revolutions on `topic`, and the frame of their points.
+    """The sensor whose packets are on `topic`, and the frame of its points.
 
-    Raises InputError when no packet is whole or known, or the metadata of an Ouster sensor are missing.
+    Raises InputError when no packet is complete or of a known model, or the metadata of an Ouster sensor are missing.
     """
     where = Path(f"{bag.path}, {topic.name}")
     if topic.type.endswith(SCANS):
@@ -108,7 +108,10 @@ def _gather(bag: Bag, topics: list[BagTopic], positions: tuple[int, ...], voice:
 
 
 def _metadata(bag: Bag, topic: BagTopic) -> tuple[OusterSensor, str]:
-    """Metadata of an Ouster sensor, from a topic beside its packets or a file beside the bag, and their source."""
+    """Metadata of an Ouster sensor, from a topic of its namespace or the only JSON file beside the bag, and their source.
+
+    Raises InputError without them.
+    """
     named = [t for t in bag.of_type("String") if "metadata" in t.name.rsplit("/", 1)[-1]]
     own = [t for t in named if _namespace(t) == _namespace(topic)] or named
     if len(own) == 1 and (text := read_text(bag, own[0].name)) is not None:

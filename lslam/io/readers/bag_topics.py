@@ -31,11 +31,11 @@ _FEW = 4  # messages that may come late at the seam of two parts
 
 
 def choose_clouds(bag: Bag, choice: str | None, voice: Voice) -> list[BagTopic]:
-    """The topics `choice`, or the only one with clouds; where there are none, the only one with packets that are decoded.
+    """The topics `choice`, or the only one with clouds; without any, the only one with packets that can be decoded.
 
-    choice : names with commas between them
+    choice : names separated by commas
 
-    Raises UsageError listing the flags when there are several or one of `choice` is not there, InputError when there is none.
+    Raises UsageError listing the flags when there are several or one of `choice` does not exist, InputError when there is none.
     """
     clouds, packets = bag.of_type(*CLOUDS), packet_topics(bag)
     if choice is not None:
@@ -66,7 +66,7 @@ def choose_clouds(bag: Bag, choice: str | None, voice: Voice) -> list[BagTopic]:
 
 
 def check_parts(bag: Bag, topic: BagTopic) -> None:
-    """Raise UsageError when the files of a folder are no parts of one recording.
+    """Raise UsageError when the files of a folder are not parts of one recording.
 
     Parts of one recording follow each other closely in time and do not overlap.
     """
@@ -132,7 +132,7 @@ def load_companion(bag: Bag, kind: Companion, choice: str | None, voice: Voice) 
 
 
 def why_none(bag: Bag, kind: Companion) -> LslamError:
-    """Advice for a user who needs a stream that was not loaded: choose one of several topics, or there is none."""
+    """The error for a stream that was needed but not loaded: choose one of several topics, or there is none."""
     topics = bag.of_type(*kind.type.split(" or "))
     if len(topics) > 1:
         flags = _flags(topics, kind.flag)
@@ -144,8 +144,8 @@ def why_none(bag: Bag, kind: Companion) -> LslamError:
 def index_scans(bag: Bag, topic: BagTopic, choice: str | None, voice: Voice) -> list[ScanIndex]:
     """Scans of each chosen LiDAR of `topic`, see `choose_lidars`, with increasing stamps.
 
-    Only headers are read, unless stamps repeat. Raises InputError when none can be read, UsageError for a LiDAR that is not
-    there.
+    Only headers are read, unless stamps repeat. Raises InputError when none can be read, UsageError for a LiDAR that does not
+    exist.
     """
     is_livox, is_ros1 = topic.type.endswith("CustomMsg"), topic.encoding == "ros1"
 
@@ -200,10 +200,10 @@ def _no_copies(stamps: Stamps, content: Callable[[int], bytes], what: str, voice
 
 
 def put_in_order(stamps: Stamps, recording_ns: Stamps, what: str, voice: Voice) -> tuple[Stamps, Stamps]:
-    """Messages that are kept, in order, and their increasing stamps; faults are added to the problems.
+    """Indices of the messages to keep, in order, and their increasing stamps; faults are added to the problems.
 
     Constant stamps are replaced by the times of recording, which also correct steps of the stamps (`clocks`). Messages that
-    are a few places late are sorted in. Dropped are repeated stamps, and messages that go back further by both clocks or
+    are a few positions late are sorted in. Dropped are repeated stamps, and messages that go back further by both clocks or
     repeat a span of time.
     """
     if stands_still(stamps, recording_ns):
@@ -234,7 +234,7 @@ def put_in_order(stamps: Stamps, recording_ns: Stamps, what: str, voice: Voice) 
 
 
 def _lateness(stamps: Stamps) -> tuple[Stamps, Bools]:
-    """(N,) lateness of each stamp against the latest one before, ns, and whether it is more than jitter."""
+    """(N,) delay of each stamp relative to the latest one before it, ns, and whether it exceeds jitter."""
     late = np.maximum.accumulate(stamps) - stamps if len(stamps) else stamps
     steps = np.diff(stamps)
     if not (late > 0).any() or not (steps > 0).any():
@@ -256,6 +256,7 @@ def _told_again(stamps: Stamps, late: Stamps, step: float) -> Bools:
 
 
 def _find_topic(bag: Bag, topics: list[BagTopic], choice: str, flag: str, what: str) -> BagTopic:
+    """The one of `topics` named `choice`; raises UsageError naming the `flag` and the choices if there is none."""
     for own in topics:
         if own.name.strip("/") == choice.strip("/"):
             return own

@@ -36,6 +36,7 @@ def folder_cameras(folder: Path, infos: Mapping[str, CameraInfo]) -> list[Camera
 
 
 def _folder_camera(folder: Path, name: str, info: CameraInfo) -> Camera:
+    """Camera `name` of a folder, by its table in `sequence.toml`. Raises InputError for missing images or stamps."""
     files = _images(folder / info.images, f"named by cameras.{name} of {folder / FILE_NAME}")
     path = folder / info.stamps_file
     if not path.is_file():
@@ -124,7 +125,7 @@ def _read_file(files: list[Path], k: int) -> Image:
 def bag_cameras(
     bag: Bag, links: Links, lidar: str, ahead: Ahead, infos_in_toml: Mapping[str, CameraInfo] | None
 ) -> list[Camera]:
-    """Cameras of a bag, by name of their topics; of a raw and a compressed topic of the same images the raw one.
+    """Cameras of a bag, by topic; if the same images have a raw and a compressed topic, the raw one is used.
 
     links, lidar : transforms, and the frame of the scans; infos_in_toml : cameras of `sequence.toml`, whose `images` name a topic
 
@@ -155,6 +156,7 @@ def bag_cameras(
 def _bag_camera(
     bag: Bag, topic: BagTopic, links: Links, lidar: str, ahead: Ahead, infos_in_toml: tuple[str, CameraInfo] | None
 ) -> Camera:
+    """Camera of an image topic, with lens and extrinsics by `infos_in_toml`, else by the bag. Raises InputError without them."""
     heads = [(k, head) for k, head in bag.each(topic, partial(read_header, topic), links.voice.problems, HEADER)]
     if not heads:
         raise InputError(f"{topic.name} has no image that can be read")
@@ -182,7 +184,7 @@ def _bag_camera(
 
 
 def _bag_lens(bag: Bag, topic: BagTopic) -> Lens:
-    """The lens by the CameraInfo beside the images. Raises InputError where there is none, or one that is not filled in."""
+    """The lens by the CameraInfo topic of the images. Raises InputError where it is missing, empty, or of an unknown model."""
     image = topic.name.removesuffix(_COMPRESSION_SUFFIX)
     beside = (f"{image.rpartition('/')[0]}/camera_info", f"{image}/camera_info")
     infos = [t for t in bag.of_type("CameraInfo") if t.name in beside]
@@ -211,6 +213,7 @@ def _bag_lens(bag: Bag, topic: BagTopic) -> Lens:
 
 
 def _read_message(bag: Bag, topic: BagTopic, numbers: Longs, k: int) -> Image:
+    """Pixels of image `k` of a topic; numbers : (N,) its messages in order."""
     number = int(numbers[k])
     source = f"{bag.path}, {topic.name}, message {number}"
     message: Any = bag.decode(topic, bag.message(topic, number))

@@ -49,13 +49,13 @@ def stands_still(stamps: Stamps, witness: Stamps) -> bool:
 
 
 def agree(headers: Stamps, late_ns: Stamps, witness: Clock, what: str, voice: Voice) -> Stamps:
-    """Stamps `headers` (N,) with their steps removed with help of the witness (N,), both in the order of recording.
+    """Stamps `headers` (N,) with their clock's steps removed by comparison with the witness (N,), both in order of recording.
 
-    late_ns : (N,) delay of messages that came out of order, 0 for most; delayed ones say nothing about the clock
+    late_ns : (N,) delay of messages that came out of order, 0 for most; delayed ones are not used
 
     Where both clocks pause, nothing is wrong. An interval of the headers is a step where the witness contradicts it and it is
     impossible for a clock whose messages are recorded late and never early. Regular headers remain regular: the interval
-    across a step is a whole number of periods. A witness that runs at another speed does not count.
+    across a step is a whole number of periods. A witness that runs at another speed is ignored.
     """
     is_set_back = _in_turns(headers, witness.stamps_ns) or _set_back(headers, witness.stamps_ns, late_ns)
     late_ns = np.where(is_set_back, 0, late_ns)
@@ -175,7 +175,7 @@ def say_jitter(stamps: Stamps, what: str, voice: Voice) -> None:
 
 
 def _period_and_speed(h: Stamps, w: Stamps) -> tuple[float, float]:
-    """Interval, ns, 0 for a clock that stands still, and the relative speed of `w`, from the windows that agree best."""
+    """Interval, ns, 0 for a constant clock, and the relative speed of `w`, from the windows that agree best."""
     best = (np.inf, 0.0, 0.0)
     for length in _WINDOWS:
         if len(h) < 2 * length:
@@ -201,7 +201,7 @@ def runs(mask: Bools) -> Longs:
 
 
 def _set_back(h: Stamps, w: Stamps, late_ns: Stamps) -> Bools:
-    """(N,) whether late messages came in order, from a clock that was set back and stayed so."""
+    """(N,) whether late messages came in order, from a clock that was set back permanently."""
     back = np.zeros(len(h), np.bool_)
     if not late_ns.any():
         return back
@@ -235,9 +235,9 @@ def _delay_range(w: Stamps, period: float) -> float:
 def _step_sizes(h: Stamps, w: Stamps, edges: Stamps, limit: float) -> Stamps:
     """Step of the clock `h` between messages k and k + 1 for every k of `edges`, ns; 0 where there is none.
 
-    h - w is an offset less the delay of recording, so its largest values tell. Where the clock goes back or stands still it is
-    wrong. Where it goes on, a delay could be the reason instead: it is a step only if no message on the same stretch that
-    increases was recorded with so little delay.
+    h - w is an offset minus the delay of recording, so its maxima count. A clock that goes back or is constant is
+    wrong. Where it goes on, a delay could be the reason instead: it is a step only if no message on the same increasing
+    stretch was recorded with so little delay.
     """
     ahead = h - w
     backward = np.flatnonzero(np.diff(h) <= 0)

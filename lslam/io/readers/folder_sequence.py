@@ -44,7 +44,7 @@ class FolderSequence(SequenceOnDisk):
     files : one per scan; correction_deg : rotation of every point about p x z, 0 for none
     rows, cols : organised clouds, point r * cols + c has ring r; per_point : folder of `<stem>.npz` with `t` and `ring`
     sweep_s : (N, 2) begin and end of each sweep, s from its stamp, when per-point times follow from the azimuth; else None
-    record : of the points, where the files do not name their fields
+    record : of the points, for files without named fields
     """
 
     files: list[Path]
@@ -186,7 +186,7 @@ def _read_per_point(
 
 
 def scan_record(files: list[Path], info: SequenceInfo, voice: Voice) -> PointRecord | None:
-    """The record of `.bin` files and plain arrays, None where fields have names. Raises InputError when none or several fit."""
+    """The record of `.bin` files and plain arrays, None for files with named fields. Raises InputError if none or several fit."""
     suffix = files[0].suffix.lower()
     if suffix not in (".bin", ".npy"):
         return None

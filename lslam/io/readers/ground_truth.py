@@ -57,7 +57,10 @@ class Voice:
 
 
 def find_ground_truth(folder: Path, info: SequenceInfo, voice: Voice) -> Path | None:
-    """The file `sequence.toml` names, else the first of the usual names in `folder`."""
+    """The file that `sequence.toml` names, else the first of `USUAL_NAMES` in `folder`; None without one.
+
+    A missing named file is added to the problems.
+    """
     if info.ground_truth is not None:
         path = folder / info.ground_truth
         path = path.resolve() if isinstance(path, RemotePath) else Path(os.path.normpath(path))
@@ -122,7 +125,7 @@ def to_lidar(
     """`truth`, poses of `frame`, as poses of the LiDAR; None, with the reason in the problems, when extrinsics are missing.
 
     KITTI's camera poses live in a world that is camera 0 at the start: T_world_lidar = inv(Tr) @ T_cam0 @ Tr.
-    Positions alone cannot be carried: a lever arm turns with the body.
+    Positions without rotations are not transformed, since the lever arm rotates with the body; a note says so.
     """
     if not truth.has_rotations:
         sentence = f"ground truth {truth.source} has positions without rotations: taken as the LiDAR's"
@@ -179,7 +182,7 @@ def _pair(truth: Trajectory, stamps_ns: Longs, files: list[Path], voice: Voice) 
 def oxts_truth(oxts: Oxts, scan_stamps_ns: Longs, T_lidar_imu: Floats | None, voice: Voice) -> Trajectory | None:
     """LiDAR poses from OXTS at the stamps of the scans, in the frame of the first; None, with a note, when data are missing.
 
-    As the devkit's convertOxtsToPose (R = Rz(yaw) Ry(pitch) Rx(roll)), but with positions in a transverse Mercator
+    Rotations as by the devkit's convertOxtsToPose, Rz(yaw) Ry(pitch) Rx(roll), but positions in a transverse Mercator
     projection at the first fix: the devkit's spherical one stretches Karlsruhe by 0.1 to 0.2 %.
     """
     if oxts.stamps_ns is None or len(oxts.stamps_ns) < 2:

@@ -71,6 +71,7 @@ def open_folder(path: Path, overrides: SequenceInfo, why: str) -> FolderSequence
 
 
 def _stamps(folder: Folder) -> tuple[Longs, float]:
+    """Stamps (N,), ns, of the scans, by the file of times or else nominal, and the rate, Hz."""
     path = folder.path / (folder.info.stamps or "times.txt")
     stamps = load_stamps(path, folder.voice.problems) if path.is_file() else None
     if stamps is not None:
@@ -97,6 +98,7 @@ def _read_tr(path: Path) -> Floats:
 
 
 def _ground_truth(folder: Folder, stamps: Longs, calibration: Calibration) -> Trajectory | None:
+    """Ground truth of the sequence as LiDAR poses; None without it."""
     number = sequence_number(folder.path.name) or folder.path.name
     usual = [above / "poses" / f"{number}.txt" for above in (folder.path.parent.parent, folder.path.parent)]
     path = next((p for p in usual if p.is_file()), None)

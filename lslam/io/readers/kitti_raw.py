@@ -142,6 +142,7 @@ def open_folder(path: Path, overrides: SequenceInfo, why: str) -> FolderSequence
 
 
 def _oxts(folder: Folder) -> Oxts | None:
+    """OXTS packets of the drive; None, with a problem, without valid ones."""
     place, problems = folder.path / "oxts", folder.voice.problems
     try:
         oxts = read_oxts(place)
@@ -162,7 +163,7 @@ def _oxts(folder: Folder) -> Oxts | None:
 
 
 def _stamps(folder: Folder, oxts: Oxts | None, is_extract: bool) -> tuple[Longs, float, float | None]:
-    """Stamps of the LiDAR, else of OXTS by index, else nominal; the rate, Hz; and the elapsed share of the sweep at the stamp."""
+    """Stamps of the LiDAR, else of OXTS by index, else nominal; the rate, Hz; and the share of the sweep before the stamp."""
     info, voice = folder.info, folder.voice
     compensated = bool(info.motion_compensated)
     passed = {"timestamps.txt": AHEAD, "timestamps_start.txt": AT_START}
@@ -229,6 +230,7 @@ def _sweeps(folder: Folder, rate: float) -> Floats:
 
 
 def _calibration(folder: Folder) -> Calibration:
+    """Calibration of the drive's day; a missing file is noted."""
     matrices = []
     for name, read in (("imu_to_velo", read_rigid), ("velo_to_cam", lambda path: read_raw_cam0_lidar(path.parent))):
         path = folder.path.parent / f"calib_{name}.txt"
@@ -330,10 +332,10 @@ def _with_oxts(sequence: Sequence, data_root: Path | None, kind: Companion, what
 
 
 def start_on_earth(folder: Path, data_root: Path | None = None) -> tuple[Floats, float]:
-    """Where the LiDAR of a KITTI odometry sequence is at its first scan, by OXTS of the raw drive, which `with_imu` finds.
+    """Position and heading of the LiDAR of a KITTI odometry sequence at its first scan, by OXTS of the raw drive (`with_imu`).
 
-    (3,) latitude, longitude (deg) and height (m), and its heading, deg clockwise from north. `folder` may not exist.
-    Raises InputError naming the paths looked at.
+    (3,) latitude, longitude (deg) and height (m), and heading, deg clockwise from north. `folder` may not exist.
+    Raises InputError naming the paths searched.
     """
     drive, calibration = _drive_of(folder, data_root, "no OXTS: looked", "it")
     first = DRIVES[sequence_number(folder.name)][2]
@@ -346,7 +348,10 @@ def start_on_earth(folder: Path, data_root: Path | None = None) -> tuple[Floats,
 
 
 def _drive_of(folder: Path, data_root: Path | None, missing: str, wish: str) -> tuple[Path, Path]:
-    """Raw drive of the sequence in `folder` and its calibration; raises InputError that begins with what is `missing`."""
+    """Raw drive of the sequence in `folder` and its calibration file.
+
+    Raises InputError that begins with `missing` and advises to run without `wish`.
+    """
     date, number, _ = DRIVES[sequence_number(folder.name)]
     roots = [Path(root).expanduser() for root in (data_root, os.environ.get("LSLAM_DATA")) if root]
     places = dict.fromkeys([*roots, folder, *list(folder.parents)[: 1 + _UPWARDS], Path.cwd()])

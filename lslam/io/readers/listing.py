@@ -46,8 +46,8 @@ def file_numbers(files: list[Path]) -> Longs | None:
 def rows_of(files: list[Path], count: int) -> tuple[Longs, str]:
     """Row of a file with `count` rows that belongs to each scan, -1 for none, and the rule in words.
 
-    Scans in KITTI are numbered by row, and scans may be missing. Where the numbers reach beyond the rows the i-th scan goes
-    with the i-th row.
+    Scans in KITTI are numbered by row, and scans may be missing. If a number exceeds the rows, the i-th scan belongs
+    to the i-th row.
     """
     numbers = file_numbers(files)
     if numbers is not None and len(numbers) and numbers[-1] < count and len(files) != count:
@@ -65,7 +65,7 @@ def nominal_stamps(count: int, rate_hz: float, start_ns: int = 0) -> Stamps:
 def filled_stamps(numbers: NDArray[Any], at: NDArray[Any], stamps: Stamps) -> Stamps:
     """Stamps (N,), ns, of all scans `numbers`, from `stamps` (M,) of the scans `at`.
 
-    Stamps between those are interpolated, those beyond extrapolated by the median step.
+    Stamps in between are interpolated, others extrapolated by the median step.
     """
     steps = np.diff(stamps) / np.diff(at)
     step = float(np.median(steps)) if len(steps) else 0.0

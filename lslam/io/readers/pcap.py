@@ -41,7 +41,7 @@ class PcapSequence(SequenceOnDisk):
 
 
 def locate(path: Path) -> tuple[Path, str] | None:
-    """Capture at `path`, or the only one in this folder, and the reason; None when there is none, or when scans lie beside it.
+    """Capture at `path`, or the only one in this folder, and the reason; None without one, or if the folder has scan files.
 
     Raises InputError listing the captures when a folder has several.
     """
@@ -62,7 +62,7 @@ def locate(path: Path) -> tuple[Path, str] | None:
 def open_folder(path: Path, overrides: SequenceInfo, why: str) -> PcapSequence:
     """Open the capture at `path`.
 
-    Raises InputError when it is unreadable, holds no packets of a sensor that is known, or lacks the metadata they need.
+    Raises InputError when it is unreadable, has no packets of a known sensor, or lacks the metadata they need.
     """
     info, _ = read_info(path.parent, overrides)
     voice = Voice([f"format {KIND}: {why}", *compensation_note(info)], [])

@@ -113,7 +113,7 @@ def of_one_sender(datagrams: Packets, which: Longs, what: str, voice: Voice) -> 
 def no_slivers(shares: NDArray[np.floating[Any]], voice: Voice) -> Bools:
     """(N,) whether a revolution is a scan, by its share of the usual number of packets.
 
-    Where revolutions are missing, one or two packets of an incomplete one remain: these are no scan.
+    Of an incomplete revolution between missing ones, a few packets may remain: these are no scan. Drops are reported.
     """
     keep = shares >= SLIVER
     if keep.all() or not keep.any():
@@ -125,7 +125,7 @@ def no_slivers(shares: NDArray[np.floating[Any]], voice: Voice) -> Bools:
 
 
 def in_order(times_ns: Longs, what: str, voice: Voice) -> Longs:
-    """Order of packets by their own times, duplicates once; a note is added where it is not that of the capture."""
+    """Order of packets by their own times, without duplicates; a note is added if it is not that of the capture."""
     order = np.argsort(times_ns, kind="stable")
     if late := int((np.diff(times_ns) < 0).sum()):
         voice.problems.append(f"{what} are out of order in {late} places: sorted by their own times")
@@ -226,6 +226,7 @@ def open_velodyne(path: Path, datagrams: Packets, voice: Voice) -> SpinningSenso
 
 
 def _factory(path: Path, datagrams: Packets, which: Longs) -> tuple[VelodyneModel, int]:
+    """Model and return mode of Velodyne packets, by their last two bytes; raises InputError for unknown ones."""
     mode, number = (int(v) for v in datagrams.bytes_at(which[:1], (1204, 1205))[0])
     if mode not in RETURNS or number not in MODELS:
         known = ", ".join(model.name for model in MODELS.values())
@@ -306,7 +307,7 @@ def open_ouster(path: Path, datagrams: Packets, voice: Voice) -> SpinningSensor:
 def open_with_metadata(
     path: Path, datagrams: Packets, sensor: OusterSensor, metadata: str, voice: Voice
 ) -> SpinningSensor:
-    """As `open_ouster`, with metadata already read; `metadata` names their source."""
+    """Open Ouster packets like `open_ouster`, with metadata already read; `metadata` names their source. Raises InputError."""
     which = np.flatnonzero(datagrams.sizes == sensor.packet_bytes)
     if not len(which):
         sizes, counts = np.unique(datagrams.sizes, return_counts=True)
@@ -344,7 +345,7 @@ def _shift(times_ns: Longs, captured_ns: Longs, voice: Voice) -> int:
 
 
 def _whole(count: Longs, voice: Voice) -> Longs:
-    """Frames that are scans. The first and the last may be cut off by the capture, and then are none."""
+    """Indices of complete frames by their numbers of packets; the first and the last may be cut off by the capture."""
     keep = np.ones(len(count), bool)
     if len(count) > 2:
         keep[[0, -1]] = count[[0, -1]] == count.max()
@@ -354,6 +355,7 @@ def _whole(count: Longs, voice: Voice) -> Longs:
 
 
 def _imu(datagrams: Packets, shift_ns: int, voice: Voice) -> ImuStream | None:
+    """IMU samples of an Ouster sensor, with stamps shifted by `shift_ns`; None without IMU packets."""
     which = np.flatnonzero(datagrams.sizes == IMU_SIZE)
     which = of_one_sender(datagrams, which, "IMU packets", voice)
     if not len(which):

@@ -55,7 +55,7 @@ class TimedCloud(NamedTuple):
 
 @dataclass(frozen=True)
 class PointClock:
-    """Reads the times of every scan of a recording."""
+    """Reads the point times of every scan of a recording by one rule."""
 
     rule: TimeRule
     rate_hz: float
@@ -77,6 +77,7 @@ class PointClock:
         return None if times is None or not len(times) else begin
 
     def _read_times(self, cloud: PointCloud, stamp_ns: int) -> TimedCloud:
+        """Times of a scan with the stamp `stamp_ns`, by the rule; a scan that breaks it is repaired or read by itself."""
         rule = self.rule
         if not len(cloud):
             return TimedCloud(cloud, np.zeros(0, np.float32), 0)  # an empty scan is no scan of a sensor without times
@@ -137,7 +138,7 @@ class PointClock:
         return rule.is_absolute or bool(low >= -rule.reach and high <= rule.reach)
 
     def _by_itself(self, cloud: PointCloud, stamp_ns: int, why: str) -> TimedCloud:
-        """Times of a scan that breaks the rule, judged by this scan alone, or none."""
+        """Times by this scan alone, for one that breaks the rule; without times, and with the fault `why`, if that fails."""
         with suppress(InputError):
             rule = None if self.is_of_one_scan else learn_rule([Sample(cloud, stamp_ns)], self.rate_hz)
             if rule is not None:
@@ -161,7 +162,7 @@ def read_samples(count: int, read: Callable[[int], Sample]) -> dict[int, Sample]
 def open_clock(
     samples: Sequence[Sample], rate_hz: float, info: SequenceInfo, notes: list[str], problems: list[str]
 ) -> PointClock | None:
-    """Clock of a recording's points, learnt on a few scans, with notes about it and about unread fields."""
+    """Clock of a recording's points, learnt from a few scans; None without times. Notes say so, and which fields are unread."""
     rule = None
     if not info.motion_compensated:
         try:
@@ -192,7 +193,7 @@ def open_clock(
 
 
 def _unwrap(values: NDArray[Any], usable: Bools, width: float) -> tuple[NDArray[Any], int]:
-    """Values with wrapped counters unwrapped, integers as int64, and the number of usable values that changed."""
+    """Values with overflows of an integer counter removed (int64), and the number of usable values that changed."""
     if values.dtype.kind not in "iu":
         return values, 0
     plain = values.astype(np.int64)
@@ -209,7 +210,7 @@ def _unwrap(values: NDArray[Any], usable: Bools, width: float) -> tuple[NDArray[
 def _step(values: NDArray[Any], usable: Bools, good: Bools, sweep: float) -> tuple[NDArray[Any], Bools] | None:
     """Values with a step of the clock removed, and (N,) which are valid then; None if there is no step.
 
-    good : the largest part; sweep : usual length of one
+    good : the largest cluster of times; sweep : usual length of a sweep, in the unit of the values
     """
     width = _WIDER * sweep
     rest = densest(values, usable & ~good, width)
@@ -236,7 +237,7 @@ def _is_set_back(values: NDArray[Any], sweep: float) -> bool:
 
 
 def _parts(values: NDArray[Any]) -> tuple[Bools, Bools] | None:
-    """Split times (N,) at the largest gap, in point order; None if one side has few points."""
+    """Masks of earlier and later times (N,) split at the largest gap; None if one side has few points or the order is mixed."""
     if len(values) < 2:
         return None
     ordered = np.sort(values)
@@ -277,7 +278,7 @@ def point_stamps(scans: Sequence[T], read: Callable[[T], PointCloud], rate_hz: f
 
 
 def _clock(scans: Sequence[T], read: Callable[[T], PointCloud], rate_hz: float | None) -> PointClock | None:
-    """The clock of the points when its readings are absolute, by a few scans."""
+    """Clock of the points, learnt from a few scans, if their times are absolute; else None."""
     samples = list(read_samples(len(scans), lambda index: Sample(read(scans[index]), 0)).values())
     for rate in (rate_hz,) if rate_hz else (DEFAULT_RATE_HZ, _SLOW_HZ):
         with suppress(InputError):

@@ -81,16 +81,14 @@ class _TimeReading(NamedTuple):
 def learn_rule(
     samples: Sequence[Sample], rate_hz: float, unit: str | None = None, reference: str | None = None
 ) -> TimeRule | None:
-    """Find the time field of a recording, its unit and reference, on several of its scans; None where no cloud has such a field,
-    or one that holds one value alone.
+    """Find the time field of a recording, its unit and reference, on several of its scans; None without a varying field.
 
     unit : s, ms, us or ns; reference : `start` or `end` of the scan, or `absolute`; None finds out
 
-    A field is taken when it can hold times in half of the scans that have it; fields of most scans come first. The unit is the
-    one in which a scan lasts about 1 / `rate_hz`; integers are ns when that fits too. Offsets that lie about 0 refer to the
-    scan's middle, others that are negative to its end, those that begin later than a scan can last are readings of a clock,
-    whatever its epoch (a sensor that was never told the time counts from where it was switched on, a simulator from where the
-    recording begins).
+    A field is used if it can be times in half of the scans that have it; fields of most scans come first. The unit is the
+    one in which a scan lasts about 1 / `rate_hz`; integers are ns when that fits too. Offsets about 0 refer to the
+    scan's middle, other negative ones to its end, those that begin later than a scan can last are readings of a clock
+    of any epoch (a sensor without external time counts from power-on, a simulator from the begin of the recording).
     Raises InputError with field, type, range and stamp when no field and unit fits.
     """
     refusal: InputError | None = None
@@ -189,7 +187,7 @@ def _limits(values: NDArray[Any], width: float) -> tuple[float, float]:
 
 
 def densest(values: NDArray[Any], among: Bools, width: float) -> Bools:
-    """(N,) mask of those of the finite values `among` that lie in the interval of length `width` that holds most of them."""
+    """(N,) mask of the finite values `among` that lie in the interval of length `width` with most of them."""
     if not among.any():
         return among
     ordered = np.sort(values[among])
@@ -209,9 +207,9 @@ def _is_sweep(points: NDArray[np.float32], values: NDArray[Any], low: float, hig
 
 
 def apply_rule(rule: TimeRule, values: NDArray[Any], stamp_ns: int) -> tuple[NDArray[np.float32], int]:
-    """Times (N,) float32, s, from values (N > 0,), all finite, and the shift of the stamp, ns, so that they count from it.
+    """Times (N,) float32, s, relative to the new stamp, from finite values (N > 0,), and the shift of the stamp, ns.
 
-    It becomes the scan's start, unless the offsets lie about it: then it stays in the middle.
+    The new stamp is the scan's start; for offsets about the scan's middle it is unchanged.
     """
     scale_s = rule.ns_per_unit * 1e-9
     if not rule.is_absolute and not rule.is_before_stamp:

@@ -82,7 +82,10 @@ def _scans_in(folder: Path) -> tuple[list[Path], list[str]]:
 def _stamps_and_truth(
     folder: Folder, beside: list[Longs], calibration: Calibration
 ) -> tuple[StampedScans, Trajectory | None]:
-    """Stamps from their file, the file names, or the ground truth matched by index; else nominal. And the ground truth."""
+    """Stamps from their file, the file names, or the ground truth matched by index; else nominal. And the ground truth, or None.
+
+    beside : stamps of other streams, for comparison
+    """
     info, files, voice = folder.info, folder.files, folder.voice
     own = stamp_scans(files, _stamps_file(folder), folder.read, info.rate_hz, beside, voice)
     rate = info.rate_hz or DEFAULT_RATE_HZ
@@ -127,6 +130,7 @@ def _with_scans(stream: Stream | None, scans: StampedScans, what: str, folder: F
 
 
 def _stamps_file(folder: Folder) -> Path | None:
+    """File of stamps, named by `sequence.toml` or one of `STAMP_NAMES`; None without it."""
     stated = folder.info.stamps
     for name in STAMP_NAMES if stated is None else (stated,):
         if (folder.path / name).is_file():
@@ -137,6 +141,7 @@ def _stamps_file(folder: Folder) -> Path | None:
 
 
 def _truth(folder: Folder, path: Path | None, stamps: Longs, calibration: Calibration) -> Trajectory | None:
+    """Ground truth of the file `path` as LiDAR poses; None if it is unusable."""
     truth = folder.truth(path, stamps)
     if truth is None:
         return None

@@ -55,9 +55,9 @@ def stamp_scans(
 ) -> StampedScans | None:
     """Stamp the scans by the file `path`, else by their names, else by their points; None if none of these has times.
 
-    read : the points of a file; beside : stamps of other streams, with one of which the scans share time
+    read : the points of a file; beside : stamps of other streams, one of which overlaps the scans in time
 
-    A clock that goes back, stands still or steps is replaced by the next one that contradicts it, with a note. Raises
+    A clock that goes back, is constant or steps is replaced by the next one that contradicts it, with a note. Raises
     InputError when the file's rows cannot be matched with the scans.
     """
     by_name, words = _stamps_by_name(files, voice)
@@ -96,7 +96,7 @@ def stamp_scans(
 
 
 def _stamps_by_name(files: list[Path], voice: Voice) -> tuple[dict[Path, int], str]:
-    """Stamps, ns, in the names of the files, empty where they hold none, and their format in words."""
+    """Stamps, ns, by file name, empty for names without them, and their format in words."""
     names = stamps_in_names(files)
     if names is None:
         return {}, ""
@@ -165,7 +165,7 @@ def rows_of_scans(path: Path, stamps: Stamps, files: list[Path], voice: Voice) -
 
 
 def _rows_by_name(path: Path, files: list[Path], count: int) -> Longs | None:
-    """(N,) row of each file, -1 for none, by a column that holds file names or numbers; None when there is no such column."""
+    """(N,) row of each file, -1 for none, by a column of file names or numbers; None without such a column."""
     cells = [row.text.replace(",", " ").replace(";", " ").split() for row in read_rows(path)[0]][-count:]
     if len(cells) != count or min(map(len, cells)) < 2:
         return None
@@ -206,8 +206,8 @@ class NameStamps(NamedTuple):
 def stamps_in_names(files: list[Path]) -> NameStamps | None:
     """Stamps of scan files by their names: dates, or one number since 1970 in s, ms, us or ns, or seconds and their fraction.
 
-    Numbers may stand behind or before other words and numbers. None when the names hold no times; the finest that differ in
-    all names count.
+    Other words and numbers may precede or follow. None when the names have no times; of several readings, the first that is
+    unique for every file is used.
     """
     stems = [path.stem for path in files]
     # No name holds a zero byte.
@@ -224,6 +224,7 @@ def stamps_in_names(files: list[Path]) -> NameStamps | None:
 
 
 def _dates(stems: list[str]) -> Iterator[tuple[list[int], str]]:
+    """Stamps (ns) by dates in all names, and a description; nothing if a name has none."""
     begins, fractions, counts = [], [], []
     for stem in stems:
         match = _DATE.search(stem)
@@ -248,7 +249,7 @@ def _dates(stems: list[str]) -> Iterator[tuple[list[int], str]]:
 
 
 def _pairs(groups: list[list[str]], between: list[str]) -> Iterator[tuple[list[int], str]]:
-    """Seconds, and the fraction in the number after them."""
+    """Readings of two successive numbers as seconds and their fraction, each with a description; between : separators."""
     for (whole, rest), separator in zip(pairwise(groups), between, strict=True):
         lengths = {len(text) for text in rest}
         if separator not in tuple("._-,") or max(lengths) > 9 or max(map(len, whole)) > 10 or _counts(rest):
@@ -277,6 +278,7 @@ def _in_unit(whole: list[str], rest: list[str], unit_ns: int) -> list[int]:
 
 
 def _numbers(groups: list[list[str]]) -> list[tuple[list[int], str]]:
+    """Readings of one number as a time since 1970 or of another clock, in any unit, each with a description."""
     since_1970 = [
         ([int(text) * scale for text in texts], f"{unit} since 1970")
         for unit, scale in _UNITS.items()

@@ -131,7 +131,7 @@ def settle_unit(sequence: T) -> T:
 
 
 def find_unit(scans: list[Floats]) -> tuple[str | None, str]:
-    """Unit, one of `LENGTHS`, in which the scans (N, 3) look most usual, None if unclear; and a sentence."""
+    """Most plausible length unit, of `LENGTHS`, of the scans (N, 3), None if unclear; and a sentence with the evidence."""
     reach = float(np.median([np.median(np.linalg.norm(points, axis=1)) for points in scans]))
     height = _median([_ground(points) for points in scans])
     noise = _median([_noise(points) for points in scans])
@@ -201,7 +201,7 @@ def _step(points: Floats) -> float:
 
 
 class LabelledSequence(SequenceView):
-    """Sequence whose scans get labels from files where their points have none; all else is unchanged."""
+    """A sequence whose scans get labels from files if their points have none; all else is unchanged."""
 
     def __init__(self, whole: Sequence, folder: Path, scans: list[Path]) -> None:
         super().__init__(whole, notes=[*whole.notes, f"labels of points from {folder}"])
@@ -210,7 +210,7 @@ class LabelledSequence(SequenceView):
     def scan(self, index: int) -> Scan:
         """Read scan `index` and its labels.
 
-        Labels that are missing or do not match are reported. Raises InputError as the sequence does.
+        Missing or mismatched labels are reported in the scan's `fault`. Raises InputError as the sequence does.
         """
         scan = self.whole.scan(index)
         if scan.labels is not None or not len(scan):

@@ -102,7 +102,7 @@ def calibration_over(info: SequenceInfo, calibration: Calibration) -> Calibratio
 
 
 def per_point_folder(folder: Path, info: SequenceInfo) -> Path | None:
-    """The folder of per-point times and rings that `sequence.toml` names. Raises InputError when it is not there."""
+    """The folder of per-point times and rings that `sequence.toml` names, or None. Raises InputError when it does not exist."""
     if info.per_point is None:
         return None
     path = folder / info.per_point
@@ -114,6 +114,7 @@ def per_point_folder(folder: Path, info: SequenceInfo) -> Path | None:
 def _load(
     folder: Path, stated_name: str | None, usual: str, read: Callable[[Path, list[str]], T], voice: Voice
 ) -> T | None:
+    """The file `stated_name` of `sequence.toml`, or `usual`, read by `read`; None, perhaps with a problem, without a valid one."""
     path = folder / (stated_name or usual)
     if not path.is_file():
         if stated_name is not None:

@@ -28,10 +28,10 @@ LIGHT_M_S = 299_792_458.0
 def read_wheels(
     sequence: Sequence, source: str, frame: str, wheelbase_m: float | None, notes: list[str], problems: list[str]
 ) -> WheelStream:
-    """The wheels of `source`, on the clock of the scans, where `frame` or their own frame sits.
+    """The wheel speeds of `source`, on the clock of the scans, with the extrinsics of `frame` or of their own frame.
 
-    Raises InputError for a file that is missing or says nothing, and for readings that share no time with the scans;
-    UsageError for a topic that is not there.
+    source : topic of the bag, or CSV file. Raises InputError for a file that is missing or has no usable readings, and for
+    readings that share no time with the scans; UsageError for a topic that does not exist.
     """
     bag = getattr(sequence, "bag", None)
     if isinstance(bag, Bag):
@@ -68,6 +68,7 @@ def read_wheels(
 
 
 def _of_file(sequence: Sequence, source: str, wheelbase_m: float | None, notes: list[str]) -> WheelStream:
+    """Wheel speeds of a CSV file beside the scans or at the path `source`; raises InputError without it."""
     folder = sequence.path if sequence.path.is_dir() else sequence.path.parent
     places = [folder / source, Path(source)]
     path = next((place for place in places if place.is_file()), None)
@@ -79,7 +80,7 @@ def _of_file(sequence: Sequence, source: str, wheelbase_m: float | None, notes: 
 
 
 def _of_bag(sequence: Sequence, bag: Bag, source: str, voice: Voice) -> tuple[WheelStream, str]:
-    """The wheels of a topic, and their frame."""
+    """Wheel speeds of the topic `source`, by its twists or else its poses, and their frame; raises InputError without any."""
     stream = load_companion(bag, WHEELS, source, voice)
     if stream is None:
         raise InputError(f"{bag.path}: {source} holds no speeds that can be used")
