@@ -110,7 +110,7 @@ def cause(error: BaseException) -> str:
 
 @contextlib.contextmanager
 def input_errors(place: object, *kinds: type[Exception], as_what: str = "") -> Iterator[None]:
-    """Turn an OSError, or one of further `kinds`, of the block into an InputError: `place` cannot be read, `as_what`, and why."""
+    """Turn an OSError, or one of further `kinds`, inside the block into InputError: `place` cannot be read as `as_what`."""
     caught: tuple[type[Exception], ...] = (OSError, *kinds)
     try:
         yield

@@ -39,7 +39,7 @@ def install_command(extra: str) -> str:
 
 
 def _requirement(extra: str) -> str:
-    """By what pip was told (PEP 610): a path that is there, an address; else the folder of sources, or the name."""
+    """pip's requirement for this installation with `extra`: by its direct URL (PEP 610), its folder of sources, or its name."""
     from importlib.metadata import PackageNotFoundError, distribution  # late, as for plug-ins
 
     named = f"lslam[{extra}]"
@@ -75,7 +75,7 @@ def importing(library: str, way_out: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def importing_open3d() -> Iterator[None]:
-    """As `importing`, for Open3D: it needs libusb, libGL and libX11, which a bare machine lacks.
+    """Context like `importing` for Open3D, which needs libusb, libGL and libX11, missing on a bare machine.
 
     The libusb of the wheel `libusb-package` is loaded first: Open3D then finds it.
     """
@@ -94,9 +94,9 @@ Table = Mapping[str, tuple[str, str]]
 
 
 def find_plugins(group: str, own: Mapping[str, object]) -> dict[str, EntryPoint]:
-    """What other packages register under `group`, by name; they cannot take the name of anything of our `own`.
+    """Entry points of other packages in `group`, by name; names of our `own` objects are reserved.
 
-    Of two packages with one name the first in the alphabet has it, whatever was installed last.
+    If two packages have the same name, the alphabetically first package wins.
     """
     from importlib.metadata import entry_points  # imported late: as much work as the whole command line
 
@@ -137,7 +137,7 @@ def factory(group: str, own: Table, name: str, what: str) -> Callable[..., Any]:
 
 
 def load(entry: EntryPoint, what: str) -> Any:
-    """What the entry point names. Raises InputError naming the package when it is broken."""
+    """The object of an entry point; `what` it is, for messages. Raises InputError naming the package when it is broken."""
     try:
         return entry.load()
     except Exception as error:

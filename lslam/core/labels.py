@@ -70,7 +70,7 @@ def parse_classes(value: Any) -> tuple[str, ...]:
 
 
 def numbers_of(names: Iterable[str]) -> set[int]:
-    """Numbers of the classes that are named. Raises ValueError for one that is unknown."""
+    """Numbers of the classes `names`. Raises ValueError for an unknown one."""
     numbers: set[int] = set()
     for name in names:
         if name.isdecimal() and int(name) < _VALUES:
@@ -96,7 +96,7 @@ def table_of(names: Iterable[str]) -> NDArray[np.bool_]:
 
 
 def asprs_table() -> NDArray[np.uint8]:
-    """(65536,) class of LAS of each label."""
+    """(65536,) ASPRS class, as LAS has them, of each label; 1 for labels without one, 0 for unlabelled points."""
     import numpy as np
 
     table = np.ones(_VALUES, np.uint8)

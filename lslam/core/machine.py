@@ -34,9 +34,9 @@ log = logging.getLogger("lslam")
 
 
 def lock(stream: IO[str], wait: bool = False) -> bool:
-    """Whether the lock of an open file is ours now; where the system or the file system has no locks, always.
+    """Lock an open file; returns whether we have the lock. True on systems without locks.
 
-    wait : until whoever holds it lets go
+    wait : block until the present owner releases it; else return False at once
     """
     try:
         import fcntl
@@ -51,9 +51,9 @@ def lock(stream: IO[str], wait: bool = False) -> bool:
 
 @contextlib.contextmanager
 def one_at_a_time(path: Path | None, doing: str) -> Iterator[None]:
-    """Hold `path`, made when it is missing, during the block: others wait. Where it cannot be made, or is None, nobody does.
+    """Lock the file `path`, made when missing, during the block; others wait. No lock if it cannot be made, or is None.
 
-    doing : what whoever holds it does, for who waits: "compiles the kernels"
+    doing : activity of its owner, for the message to those who wait: "compiles the kernels"
     """
     if path is None:
         yield
@@ -73,7 +73,7 @@ def one_at_a_time(path: Path | None, doing: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def rarely_collecting() -> Iterator[None]:
-    """Collect garbage rarely: compiling and importing make millions of objects that stay; scanning them is a tenth of it."""
+    """Collect garbage rarely inside the block: compiling and importing make millions of permanent objects."""
     before = gc.get_threshold()
     gc.set_threshold(100_000, *before[1:])
     try:

@@ -23,7 +23,7 @@ def printable(text: str) -> str:
 
 
 def file_safe(name: str) -> str:
-    """A name that can be a folder's: it may come from `sequence.toml`, shall not lead elsewhere, and may be of any length.
+    """A valid folder name made of `name`, which may contain separators or be of any length.
 
     >>> file_safe("../street 0"), len(file_safe("x" * 400))
     ('_street_0', 120)

@@ -29,10 +29,10 @@ class Interrupt(KeyboardInterrupt):
 
 
 class Stop:
-    """Whether somebody asked to stop.
+    """Record of a request to stop.
 
-    While `is_gentle`, the first signal only says so; otherwise, and for the second one, it raises Interrupt where Python is,
-    but never in a kernel or in LLVM. may_force : whether a second one means more than the first
+    While `is_gentle`, the first signal only sets it; otherwise, and on the second signal, Interrupt is raised in the running
+    Python code, but never in a kernel or in LLVM. may_force : whether a second signal is treated so
     """
 
     def __init__(self, may_force: bool = True) -> None:
@@ -51,7 +51,7 @@ class Stop:
             raise Interrupt
 
     def on_signal(self, number: int, frame: FrameType | None) -> None:
-        """The handler."""
+        """Handler of the signal `number` at `frame`: record it, and raise Interrupt if that is due and safe there."""
         if self._comes_again:
             self._comes_again = False
         else:
@@ -95,7 +95,7 @@ def current() -> Stop:
 
 @contextmanager
 def handle_signals(numbers: Sequence[int] = SIGNALS, may_force: bool = True) -> Iterator[Stop]:
-    """Heed signals for the length of the block; in a block within one, and in other threads than the first, nothing changes."""
+    """Handle the signals inside the block by a `Stop`; a nested block, or one in another thread, changes nothing."""
     global _current
     if _current is not None or current_thread() is not main_thread():
         stop = current()

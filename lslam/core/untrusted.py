@@ -28,7 +28,7 @@ _TOO_LONG = "a whole number has thousands of digits"
 
 
 def parse_json(text: str | bytes) -> Any:
-    """The tree of a JSON text. Raises ValueError saying what is wrong with it."""
+    """The tree of a JSON text. Raises ValueError for a malformed, too deep or too large one."""
     try:
         tree = json.loads(text, parse_int=_whole)
     except RecursionError:
@@ -38,7 +38,7 @@ def parse_json(text: str | bytes) -> Any:
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """The tree of a TOML text. Raises tomllib.TOMLDecodeError saying what is wrong with it."""
+    """The tree of a TOML text. Raises tomllib.TOMLDecodeError for a malformed, too deep or too large one."""
     try:
         tree = tomllib.loads(text)
     except RecursionError:
@@ -78,7 +78,7 @@ def _whole(digits: str) -> int:
 
 
 def _check(tree: Any) -> None:
-    """Raise ValueError for a tree that is too deep or holds whole numbers that are too large."""
+    """Raise ValueError for a tree that is too deep or has integers of more than 64 bits."""
     open_ones = [iter((tree,))]
     while open_ones:
         for node in open_ones[-1]:
@@ -96,12 +96,12 @@ def _check(tree: Any) -> None:
 
 
 class JsonItems:
-    """The items of one list of a JSON object, one at a time: neither the text nor the tree of the whole is ever in memory.
+    """Iterates over one list of a JSON object, one item at a time: the whole text or tree is never in memory.
 
-    stream : of the text; key : of the list, at the top of the object. Iterate once; then `rest` holds all else of the object,
-    and `has_list` says whether there was such a list. Of what is no object, `rest` is empty.
+    stream : of the text; key : of the list, at the top of the object. Iterate once; then `rest` has all else of the object,
+    and `has_list` says whether there was such a list. For a text that is no object, `rest` is empty.
 
-    Raises ValueError as `parse_json`; json.JSONDecodeError or UnicodeDecodeError, which are such, when it is no JSON.
+    Raises ValueError as `parse_json`; json.JSONDecodeError or UnicodeDecodeError, its subclasses, when it is no JSON.
     """
 
     def __init__(self, stream: IO[bytes], key: str) -> None:
@@ -110,6 +110,7 @@ class JsonItems:
         self.has_list = False
 
     def __iter__(self) -> Iterator[Any]:
+        """Items of the list `key`; the other members go to `rest`."""
         text = _Window(self._stream)
         if text.peek() == "{":
             yield from self._members(text)
@@ -119,6 +120,7 @@ class JsonItems:
             raise text.error("Extra data")
 
     def _members(self, text: _Window) -> Iterator[Any]:
+        """Read the members of the object, yield the items of the list, store the others."""
         text.take("{")
         if text.peek() == "}":
             text.take("}")
@@ -142,7 +144,7 @@ class JsonItems:
 
 
 class _Window:
-    """The part of a JSON text that is looked at."""
+    """The buffered part of a JSON text."""
 
     def __init__(self, stream: IO[bytes]) -> None:
         self._stream = stream
@@ -153,7 +155,7 @@ class _Window:
         self._column = 0
 
     def peek(self) -> str:
-        """The next character that is no blank; empty at the end."""
+        """The next character that is not blank, without consuming it; empty at the end."""
         while True:
             found = _BLANK.match(self._text, self._at)
             assert found is not None
@@ -172,7 +174,7 @@ class _Window:
         return found
 
     def value(self) -> Any:
-        """The next value, whole."""
+        """Read the next complete value. Raises ValueError or json.JSONDecodeError."""
         self.peek()
         while True:
             try:
@@ -192,7 +194,7 @@ class _Window:
         return value
 
     def items(self) -> Iterator[Any]:
-        """Those of the list that comes next."""
+        """The items of the list that comes next, read one at a time."""
         self.take("[")
         if self.peek() == "]":
             self.take("]")
@@ -216,7 +218,7 @@ class _Window:
         return self._lines + ends, column
 
     def _more(self) -> bool:
-        """Read on, at least as much as there is, so that a long value is begun anew a few times only; False at the end."""
+        """Read the next block, at least as long as the unread rest, so that long values are restarted rarely; False at the end."""
         if self._is_over:
             return False
         self._lines, self._column = self._place()

@@ -10,7 +10,7 @@ NUMBER = "00"  # of the one sequence in the folder
 
 
 def check_target(out: Path, overwrite: bool, resume: bool = False) -> None:
-    """Raise OutputExistsError when `out` is a file, or holds something and neither `overwrite` nor `resume` allows that."""
+    """Raise OutputExistsError when `out` is a file, or not empty and neither `overwrite` nor `resume` permits that."""
     try:
         if out.exists() and not out.is_dir():
             raise OutputExistsError(f"{out} is a file: give --out a folder that does not exist yet")

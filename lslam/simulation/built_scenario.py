@@ -104,9 +104,9 @@ def build_scenario(
 
 
 def whole_map(scenario: Scenario, seed: int, extract: MapExtract) -> tuple[OsmCity, Floats]:
-    """City of the whole `extract`, and the line (N, 3) along its streets that would be driven; no points if there is none.
+    """City of the whole `extract`, and the line (N, 3) along its streets that a drive would take; no points if there is none.
 
-    A plan for picking way-points shows it.
+    It is drawn on a plan for picking way-points.
     """
     place, build = (np.random.default_rng([seed, 2**32 - k]) for k in (1, 2))
     terrain = _terrain(scenario, place)
@@ -137,6 +137,7 @@ def _terrain(scenario: Scenario, rng: np.random.Generator) -> Terrain:
 
 
 def _city(scenario: Scenario, street: RouteCurve, terrain: Terrain, rng: np.random.Generator) -> City:
+    """Build the city of the scenario's kind of world along the street."""
     world = scenario.world
     if world.kind == "street":
         return build_city(street, terrain, scenario.layout, rng)
@@ -158,6 +159,7 @@ def _city(scenario: Scenario, street: RouteCurve, terrain: Terrain, rng: np.rand
 
 
 def _check_radius(scenario: Scenario, line: RouteCurve) -> None:
+    """Raise UsageError for bends too tight for the carrier, or for a drone's lateral acceleration."""
     s = line.sample(0.25)
     curvature = line.curvature(s)
     least, worst = TIGHTEST[scenario.carrier], int(np.argmax(np.abs(curvature)))

@@ -77,7 +77,7 @@ class SimulatedCamera:
         return Camera(NAME, self.model.lens, self.T_lidar_camera, self.stamps_ns, self.image)
 
     def image(self, index: int) -> Image:
-        """Image `index`, (height, width, 3)."""
+        """Simulate image `index`, (height, width, 3) uint8 RGB, with motion blur and noise."""
         middle, model = self.stamps_ns[index] / 1e9, self.model
         shares = (np.arange(model.instants) + 0.5) / model.instants - 0.5
         width, height = model.lens.size
@@ -100,7 +100,7 @@ class SimulatedCamera:
         return np.where(np.isfinite(hits.distance), hits.surface, len(Surface)).astype(np.intp)
 
     def _wandering(self) -> Floats:
-        """Brightness of each image: one that adapts over ten images, about 1."""
+        """Brightness factor of each image, about 1: a random process with a memory of ten images, like an automatic exposure."""
         rng = np.random.default_rng([self.drive.seed, _SEED])
         level, levels = 0.0, np.empty(len(self))
         stay = np.exp(-0.1)
@@ -111,7 +111,7 @@ class SimulatedCamera:
 
 
 def write_images(camera: SimulatedCamera, folder: Path) -> Iterator[int]:
-    """Write the images missing in `folder`/front and their stamps; yields the number of each that is there."""
+    """Write the images missing in `folder`/front and their stamps; yields the number of each image, also of existing ones."""
     place = folder / NAME
     place.mkdir(parents=True, exist_ok=True)
     with ThreadPoolExecutor(2, thread_name_prefix="render") as pool:

@@ -146,7 +146,7 @@ class Lots:
         self._circles = np.zeros((0, 3))
 
     def is_free(self, corners: Floats) -> bool:
-        """True when a polygon (K, 2) touches neither a street nor a house."""
+        """True when a polygon (K, 2) overlaps neither a street nor a house."""
         polygon = self.polygon(corners)
         if self.corridor.intersects(polygon):
             return False
@@ -171,7 +171,7 @@ def _circle(corners: Floats) -> tuple[float, float, float]:
 def add_road(site: StreetSite, away: Callable[[Floats], Floats] | None = None) -> None:
     """Add road, kerbs and pavements as one strip along the street.
 
-    away : distance of places (..., 2) to the nearest middle of a road, m: where another road crosses there is no kerb
+    away : returns the distance of positions (..., 2) to the nearest road axis, m; where another road crosses there is no kerb
     """
     street, layout = site.street, site.layout
     s = street.sample(0.75)
@@ -196,9 +196,9 @@ def add_road(site: StreetSite, away: Callable[[Floats], Floats] | None = None) -
 
 
 def add_ground(site: StreetSite, streets: list[RouteCurve], overlap: float, level: float = KERB - 0.07) -> None:
-    """Add grass everywhere but on `streets`, `level` m above the terrain.
+    """Add grass everywhere except on `streets`, `level` m above the terrain.
 
-    It reaches `overlap` m under pavements, or under roads without any. The level is a little below theirs, so that their edge
+    It extends `overlap` m under pavements, or under roads without any. The level is a little below theirs, so that their edge
     is visible and no grass pokes through.
     """
     from scipy.spatial import cKDTree
@@ -215,7 +215,7 @@ def add_ground(site: StreetSite, streets: list[RouteCurve], overlap: float, leve
 
 
 def add_row(site: StreetSite, lots: Lots, side: int, first: bool) -> None:
-    """Add houses side by side along one side of the street (1 left, -1 right), where there is room."""
+    """Add houses along one side of the street (1 left, -1 right), where there is room; first : at the street, or behind."""
     street, layout, rng = site.street, site.layout, site.rng
     s, setback = rng.uniform(0, 4), rng.uniform(*layout.setback)
     while s < street.length:
@@ -281,7 +281,7 @@ def add_street_furniture(
 ) -> None:
     """Add parked cars, trees, poles and bins along one side.
 
-    `is_free` tells whether a place (2,), with its offset and yaw, is free.
+    `is_free` returns whether an object at (2,), with its offset, m, and yaw, has room.
     """
     street, layout, rng = site.street, site.layout, site.rng
 

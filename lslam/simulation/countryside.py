@@ -190,8 +190,8 @@ def _add_country(site: StreetSite) -> Houses:
 def build_woods(street: RouteCurve, terrain: Terrain, layout: Layout, rng: np.random.Generator) -> City:
     """Build a path through woods or a park along `street`; the same generator state gives the same woods.
 
-    Of `layout` it takes the road's half width and verge (`pavement`), `garden_trees` per 5 m of way and side, of which the
-    share `trees` grows, and hedges beside the way by the share of `gardens`; bins and lamps; a house by `openings`.
+    `layout` defines the road's half width and verge (`pavement`), `garden_trees` per 5 m of way and side, of which the
+    share `trees` grows, hedges along the way by the share of `gardens`, bins, lamps, and houses by `openings`.
     """
     site = StreetSite.begin(street, terrain, layout, rng)
     _add_strip(site, sorted({0.0, 0.5 * layout.road, layout.road, layout.band}))
@@ -270,7 +270,7 @@ def build_carpark(
     """Build a car park round the path `line`; `roughness` is the standard deviation of the ground's surface, m.
 
     Rough sloping ground, a low wall and trees on one side, distant houses on the other, a few cars. Objects are placed in order
-    along x, each kind with a generator of its own, so a longer path has the same beginning. Raises UsageError for a path that is
+    along x, each kind by its own generator, so a longer path has the same beginning. Raises UsageError for a path that is
     too long.
     """
     walls, trees, cars, houses, ground = rng.spawn(5)

@@ -22,7 +22,7 @@ BUSHES = 0.35  # share of the trees that are bushes, where leaves fill volumes
 
 
 def tree(rng: np.random.Generator, volume: bool = False) -> SceneMesh:
-    """A trunk with a crown of leaf clusters, which some rays pass; or with a volume of leaves; or a bush."""
+    """A tree: a trunk with a crown of leaf clusters that some rays pass, a trunk with a leaf volume, or a bush."""
     if volume:
         return _leafy(rng)
     builder = MeshBuilder()
@@ -40,6 +40,7 @@ def tree(rng: np.random.Generator, volume: bool = False) -> SceneMesh:
 
 
 def _leafy(rng: np.random.Generator) -> SceneMesh:
+    """A tree or bush whose crown is a volume of leaves."""
     builder = MeshBuilder()
     if rng.random() < BUSHES:
         size = np.array([1.0, rng.uniform(0.7, 1.4), rng.uniform(0.6, 1.0)]) * rng.uniform(0.6, 1.4)

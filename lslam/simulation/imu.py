@@ -58,8 +58,8 @@ class ImuModel:
 class ImuFaults(Section):
     """Faults added to the IMU of a scenario.
 
-    jitter_ms : standard deviation of its stamps; accel_limit, gyro_limit_deg : beyond which it saturates, m/s2 and deg/s;
-        what it measures itself when absent
+    jitter_ms : standard deviation of its stamps; accel_limit, gyro_limit_deg : range beyond which it saturates, m/s2 and deg/s;
+        None: that of the model
     """
 
     jitter_ms: float = Field(0.0, ge=0, le=100)

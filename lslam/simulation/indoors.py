@@ -79,7 +79,7 @@ def room_line() -> RouteCurve:
 
 
 def build_room(line: RouteCurve, terrain: Terrain, rng: np.random.Generator) -> City:
-    """Build the room round `room_line`; the seed decides where its furniture stands."""
+    """Build a furnished room with its floor's middle at the origin; the seed places the furniture. `line` is the path in it."""
     builder, half = MeshBuilder(), ROOM_M / 2
     low, high = np.array([-half[0], -half[1], 0.0]), np.array([half[0], half[1], ROOM_M[2]])
     # What is above a start is no roof that one would be caught under.
@@ -171,7 +171,7 @@ def stairs_line(above: float) -> tuple[RouteCurve, tuple[Floats, Floats]]:
 
 
 def build_stairwell(line: RouteCurve, terrain: Terrain, rng: np.random.Generator) -> City:
-    """Build the building round `stairs_line`; the seed decides about loose objects."""
+    """Build the building round `stairs_line`; the seed places loose objects."""
     builder = MeshBuilder()
     _add_entrance(builder, rng)
     _add_shaft(builder)

@@ -86,15 +86,17 @@ def trace(
     Parameters
     ----------
     T_city_lidar : (4, 4) one pose for all rays (a motion-compensated scan, without times), or (columns, 4, 4) the pose at
-        each firing (a distorted scan: points in the LiDAR frame of their own instant, times from 0 to `period` s)
+     each firing (a distorted scan: points in the LiDAR frame of their own instant, times from 0 to `period` s)
     rng : source of noise and losses
-    bodies : moving ones; a ray meets them at their places when it is fired (at `stamp_ns` in a compensated scan)
-    glass : share of the rays on a pane that pass it and go on to what is behind
-    roof : of the vehicle that carries the LiDAR, which is in the way of the ground
-    returns : what real surfaces and beams add; None for clean, sharp ones
+    bodies : moving objects; a ray hits them at their poses when it is fired (at `stamp_ns` in a compensated scan)
+    glass : share of the rays on a pane that pass it and hit objects behind
+    roof : of the vehicle that carries the LiDAR, which occludes the ground
+    returns : effects of real surfaces and beams; None for clean, sharp ones
     has_one_instant : whether all rays are fired at `stamp_ns`, whatever the poses; None: when there is one pose
 
-    Returns ------- The measured points, with intensity 0..1 in steps of 0.01, rings, classes and, for distorted scans, times.
+    Returns
+    -------
+    The measured points, with intensity 0..1 in steps of 0.01, rings, classes and, for distorted scans, times.
     """
     # A stream of its own: without these effects every scan stays as it is.
     extra = rng.spawn(1)[0] if returns is not None else rng
@@ -146,7 +148,7 @@ class Meeting:
 
 
 def _meet_bodies(bodies: Sequence[MovingMesh], rays: Rays, rings: int, hits: Hits, stamp: float) -> None:
-    """Replace `hits` by hits on moving bodies where these are nearer; `stamp`, s, is that of the bodies' centres."""
+    """Replace `hits` by hits on moving bodies where these are closer; `stamp`, s, is that of the bodies' centres."""
     centres = np.stack([body.centre for body in bodies])
     lasting = float(rays.times.max()) - stamp
     # Body and LiDAR both move while the sweep lasts; a millimetre for the rounding.
@@ -189,7 +191,7 @@ def _by_column(centres: Floats, radii: Floats, rays: Rays, rings: int) -> Iterat
 
 
 def _by_ray(centres: Floats, radii: Floats, rays: Rays, hits: Hits) -> Iterator[NDArray[np.intp]]:
-    """As `_by_column`, for rays that start anywhere."""
+    """For each body, the rays of any origin that may hit it: those within `radii` (B,), m, of its centre (B, 3)."""
     # Relative to their middle single precision is good for centimetres, which `reach` allows.
     middle = rays.origins.mean(axis=0, dtype=np.float64)
     start, at = (rays.origins - middle).astype(np.float32), (centres - middle).astype(np.float32)
@@ -207,7 +209,7 @@ def _by_ray(centres: Floats, radii: Floats, rays: Rays, hits: Hits) -> Iterator[
 
 
 def _meet_body(body: MovingMesh, which: NDArray[np.intp], rays: Rays, hits: Hits, stamp: float) -> None:
-    """Intersect the rays `which` with a body at its place when each of them is fired."""
+    """Intersect the rays `which` with a body at its pose when each of them is fired; closer hits replace `hits`."""
     # Between instants of a few milliseconds it moves on evenly, to micrometres; they do not hang on which rays are tried.
     share = (rays.times - stamp) / BODY_STEP
     at = share.astype(np.intp)
@@ -228,7 +230,7 @@ def _meet_body(body: MovingMesh, which: NDArray[np.intp], rays: Rays, hits: Hits
 
 
 def _meet_roof(roof: Roof, directions: NDArray[np.float32], heights: NDArray[np.float32], hits: Hits) -> None:
-    """Replace `hits` by hits on the own roof, or by none if it gives no points; rays in the LiDAR's frame."""
+    """Replace `hits` by hits on the vehicle's own roof, or by none if it returns no points; rays in the LiDAR's frame."""
     reach = roof.reach(directions, heights)
     met = np.flatnonzero(np.isfinite(reach))
     hits.distance[met] = reach[met] if roof.returns else np.inf
@@ -243,9 +245,9 @@ def _wrap_angle(angle: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _leave_panes(meeting: Meeting, rays: Rays, hits: Hits, lucky: Bools, returns: Returns | None) -> None:
-    """Mirror some of the rays that hit panes, and let the `lucky` of the others pass.
+    """Reflect some of the rays that hit panes, and let the `lucky` of the others pass.
 
-    A mirrored ray measures a point behind the pane. A passing ray hits the next object; a second pane stops it.
+    A reflected ray measures a point behind the pane. A passing ray hits the next object; a second pane stops it.
     """
     off = np.zeros(0, np.intp)
     if returns is not None and returns.mirror > 0:
@@ -320,7 +322,7 @@ def _on(steps: Floats) -> NDArray[np.float32]:
 def _detect(
     model: LidarModel, hits: Hits, rng: np.random.Generator, returns: Returns | None, wrong: Errors | None
 ) -> tuple[Bools, NDArray[np.float32], NDArray[np.float32]]:
-    """Returning rays, their measured ranges, m, and intensities.
+    """Mask of the rays that return, their measured ranges, m, and intensities, 0..1.
 
     The echo's peak is that of a diffuse surface: reflectivity times the cosine of incidence over the range squared. The
     intensity is that of the whole echo, which a slanted surface stretches, without the range: what drivers report.

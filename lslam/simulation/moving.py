@@ -26,7 +26,7 @@ NEAREST_M = 2.3  # m that the middle of anything moving keeps from the LiDAR's l
 
 @dataclass(frozen=True)
 class Mover:
-    """Body that moves on a street: at `begin` m along it at 0 s, `speed` m/s (negative: against it), `offset` m to the left.
+    """Body that moves on a street: at `begin` m along it at 0 s, `speed` m/s (negative: backwards), `offset` m to the left.
 
     On a closed street it drives laps. On an open one it enters and leaves, and outside it is placed far below the ground.
 
@@ -44,7 +44,7 @@ class Mover:
     start: tuple[float, float] | None = None
 
     def along(self, times: NDArray[Any]) -> Floats:
-        """(M,) distance along the street at `times` (M,), s, m."""
+        """(M,) distance along the street, m, at `times` (M,), s."""
         t = np.asarray(times, np.float64)
         if self.start is None:
             return self.begin + self.speed * t
@@ -95,7 +95,7 @@ def add_traffic(
 def add_queue(
     streets: list[RouteCurve], terrain: Terrain, T_city_lidar: Floats, starts: float, rng: np.random.Generator
 ) -> list[Mover]:
-    """Two buses beside a LiDAR at (4, 4) and a truck ahead, which drive off within half a second from `starts` s on."""
+    """Two buses on either side of a LiDAR at (4, 4) and a truck ahead, which drive off within half a second after `starts`, s."""
     place = T_city_lidar[:2, 3]
 
     def nearest(street: RouteCurve) -> tuple[float, float]:
@@ -144,7 +144,7 @@ def pedestrian(rng: np.random.Generator) -> SceneMesh:
 
 
 def moving_meshes(movers: list[Mover], position: NDArray[Any], time: float, reach: float) -> list[MovingMesh]:
-    """Those of `movers` within `reach` m of `position` (3,) at `time`, s, with their poses then."""
+    """Those of `movers` within `reach` m of `position` (3,) at `time`, s, as meshes with poses over time."""
     centres = _centres(movers, time)
     near = np.linalg.norm(centres - position, axis=1) < reach + np.array([mover.radius for mover in movers])
     return [
@@ -193,6 +193,7 @@ def _body(
     traffic: TrafficSection,
     pavement: float,
 ) -> Mover:
+    """A car in a lane, or a pedestrian on a pavement, at a random position and speed."""
     radius = float(np.linalg.norm(scene.mesh.vertices, axis=1).max())
     begin = rng.uniform(0, street.length)
     if is_car:

@@ -65,7 +65,7 @@ def build_osm_city(
 ) -> OsmCity:
     """Build the city of `buildings` (m, x east, y north) on `terrain`. The same generator state gives the same city.
 
-    A building's look does not depend on its neighbours. Heights that the map lacks are drawn at random. `streets` : middles
+    A building's look does not depend on its neighbours. Heights that the map lacks are drawn at random. `streets` : axes
     of the roads to pave and furnish by `layout`, the main one first; without, all ground is lawn. Raises InputError when
     there are no buildings.
     """
@@ -94,6 +94,7 @@ def build_osm_city(
 def _raise_buildings(
     builder: MeshBuilder, buildings: Sequence[Building], terrain: Terrain, seed: int
 ) -> list[Building]:
+    """Add all buildings to `builder`; returns them with heights, drawn by `seed` and number where the map has none."""
     built = []
     for building in buildings:
         kind, number = building.osm_id.split("/")
@@ -155,6 +156,7 @@ class _Gaps:
         self._walls = STRtree([Polygon(outer) for outer in outlines])
 
     def __call__(self, xy: Floats, offset: float, yaw: float) -> bool:
+        """Whether an object at `xy` (2,), `offset` m from the road's axis, has room; then it is recorded as occupied."""
         from shapely import points
 
         is_car = offset < self._road

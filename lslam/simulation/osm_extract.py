@@ -304,14 +304,14 @@ def write_extracts(
     ----------
     city : its x is east, its y north of `origin`
     origin : (3,) lat, lon (deg), height (m) of the city frame's x = y = 0
-    faults : how wrong the perturbed copy is
+    faults : magnitudes of the errors of the perturbed copy, None for the defaults
 
     Raises
     ------
     InputError : the city has no buildings; OutputError : `folder` cannot be written
 
-    The perturbation starts from the exact map as it reads back, rounded to 1e-7 deg, so `perturb` of that map and the record
-    give the perturbed file again, byte for byte.
+    The perturbation starts from the exact map after rounding to 1e-7 deg, so `perturb` of that map and the record
+    reproduces the perturbed file byte for byte.
     """
     attribution = city.attribution if isinstance(city, OsmCity) else None
     buildings = city_buildings(city)

@@ -101,7 +101,7 @@ def route_in_map(scenario: Scenario, extract: MapExtract, way_points: WayPoints 
 def city_of_map(
     scenario: Scenario, extract: MapExtract, terrain: Terrain, rng: np.random.Generator, route: Route | None
 ) -> OsmCity:
-    """City within 150 m of `route`, or of the whole extract. Raises InputError when no building is that near."""
+    """City within 150 m of `route`, or of the whole extract. Raises InputError when no building is that close."""
     whole, layout, flies = extract.buildings, scenario.layout, scenario.carrier == "drone"
     buildings = whole.buildings
     if route is not None:
@@ -123,7 +123,7 @@ def city_of_map(
 def buildings_near(extract: BuildingExtract, positions: NDArray[Any], reach: float) -> list[Building]:
     """Buildings within `reach` m of one of the `positions` (N, 2), m, in the extract's frame.
 
-    Raises InputError saying how far away the extract is when there are none.
+    Raises InputError with the distance of the extract when there are none.
     """
     from shapely import STRtree, points
 
@@ -150,7 +150,7 @@ def keep_out_of_walls(movers: list[Mover], city: OsmCity, duration: float) -> li
 
 
 def _along_streets(scenario: Scenario, extract: MapExtract, margin: float) -> Route:
-    """Path along the longest street, right of its middle."""
+    """Path along the longest street, in its right lane; raises UsageError if there is none."""
     lane, kinds = scenario.path.lane, WALKABLE if scenario.carrier == "walker" else DRIVABLE
     radius = TIGHTEST[scenario.carrier] + lane + 1.0
     if scenario.carrier == "drone":
@@ -169,9 +169,9 @@ def _along_streets(scenario: Scenario, extract: MapExtract, margin: float) -> Ro
 
 
 def fit_shape(shape: WayPoints, buildings: Sequence[Building], margin: float, source: str) -> WayPoints:
-    """The shape rotated and shifted so that it keeps `margin` m from walls, and walls are near as much of it as possible.
+    """The shape rotated and shifted so that it keeps `margin` m from walls and as many of its points as possible see walls.
 
-    Of equally good places the first in a fixed order is taken. Raises UsageError when there is none.
+    Of equally good positions the first in a fixed order is used. Raises UsageError when there is none.
     """
     points = _dense(shape)
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
@@ -218,7 +218,7 @@ def _distances(buildings: Sequence[Building]) -> tuple[Floats, NDArray[np.float3
 
 
 def _free_shifts(line: Floats, low: Floats, distance: NDArray[np.float32], margin: float) -> tuple[Floats, Longs]:
-    """Shifts (M, 2) on a grid that keep all of `line` (N, 2) on free ground, and how many of its points are near walls then."""
+    """Shifts (M, 2) on a grid that keep `line` (N, 2) on free ground, and the number of its points within sight of walls."""
     size = DISTANCE_CELL_M * np.array(distance.shape)
     x, y = (np.arange(low[k], low[k] + size[k], SHIFT) for k in (0, 1))
     shifts = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -237,7 +237,7 @@ def _free_shifts(line: Floats, low: Floats, distance: NDArray[np.float32], margi
 
 
 def highways(data: OsmData, origin: NDArray[Any], kinds: Iterable[str]) -> list[tuple[tuple[int, ...], Floats]]:
-    """Ways of the given `kinds` of highway on open ground: node numbers and corners (N, 2), m from `origin`.
+    """Ways whose `highway` tag is one of `kinds` on open ground: node numbers and corners (N, 2), m from `origin`.
 
     Tunnels, bridges, areas, and underground or indoor ways are left out. A way with missing nodes is split there.
     """
@@ -266,10 +266,10 @@ def solid_ground(buildings: Iterable[Building], margin: float) -> Any:
 def find_route(
     ways: Sequence[tuple[tuple[int, ...], Floats]], buildings: Sequence[Building], margin: float, radius: float
 ) -> Floats | None:
-    """Middle (N, 2), m, of a street to drive: the longest one in the built-up area, at most 1.5 km.
+    """Axis (N, 2), m, of a street to drive: the longest one in the built-up area, at most 1.5 km.
 
-    It is the longest of the shortest paths between two crossings. It is cut to its longest part that keeps `margin` m from
-    walls and whose bends have a radius of at least `radius` m. None where that is less than 50 m.
+    It is the longest of the shortest paths between two crossings, cut to its longest part that keeps `margin` m from
+    walls and whose bends have a radius of at least `radius` m. None if that is less than 50 m.
     """
     from shapely import distance, points
 

@@ -62,7 +62,7 @@ def suspension(rng: np.random.Generator, angle_deg: float = 0.15, heave: float =
 class VehiclePath:
     """A LiDAR `height` m above the ground on a vehicle that follows `curve`.
 
-    distance : distance along the curve over time, a smooth function of s; duration : s it is defined for
+    distance : distance along the curve, a smooth function of s; duration : s, range of that function
     """
 
     curve: RouteCurve
@@ -93,7 +93,7 @@ class VehiclePath:
 def drive(
     curve: RouteCurve, terrain: Terrain, speed: SpeedProfile, distance: float, height: float, shaking: Swing
 ) -> VehiclePath:
-    """Path along `distance` m of `curve`, lap after lap on a closed one."""
+    """Path along `distance` m of `curve`, in laps on a closed one, by the speed profile."""
     s = np.linspace(0, distance, int(np.ceil(distance / 0.25)) + 1)
     v = _speeds(curve, s, speed)
     t = np.concatenate([[0.0], np.cumsum(2 * np.diff(s) / (v[:-1] + v[1:]))])
@@ -144,10 +144,10 @@ GRAVITY = 9.81  # m/s2, for the bank of a turn
 
 
 def gait(rng: np.random.Generator, strength: float = 1.0) -> Swing:
-    """A hand-held sensor at a walk: steps of 1.9 Hz, sways of half that, and looks to both sides at up to 150 deg/s.
+    """Motion of a hand-held sensor at a walk: steps of 1.9 Hz, sways of half that, and yaw to both sides at up to 150 deg/s.
 
-    The axes are x, y, z, roll, pitch and yaw.
-    Two slow sweeps of the head that are nearly in step make it look about for a while and straight ahead for a while.
+    The axes are x, y, z (m), roll, pitch and yaw (rad); strength : factor on all.
+    Two slow yaw oscillations of similar frequency alternate between looking about and looking ahead.
     """
     amplitudes = np.array(
         [

@@ -90,6 +90,7 @@ def _lines(low: float, count: int, pixel: float, every: int) -> tuple[Longs, Lon
 
 
 def _draw_grid(image: Image, low: Floats, pixel: float) -> None:
+    """Darken the lines of the metric grid in the image; low : (2,) m of its corner, pixel : m."""
     height, width, _ = image.shape
     for every, strength in ((FINE, 0.12), (COARSE, 0.45)):
         columns = _lines(float(low[0]), width, pixel, every)[1]
@@ -99,6 +100,7 @@ def _draw_grid(image: Image, low: Floats, pixel: float) -> None:
 
 
 def _draw_path(image: Image, line: Floats, low: Floats, pixel: float) -> None:
+    """Draw the path `line` (M, 2), m, and its start into the image."""
     height, width, _ = image.shape
     steps = np.maximum(np.ceil(np.linalg.norm(np.diff(line, axis=0), axis=1) / (0.5 * pixel)).astype(int), 1)
     dense = [

@@ -103,7 +103,7 @@ def describe_drive(drive: SimulatedDrive) -> dict[str, Any]:
 
 
 def _parameters(drive: SimulatedDrive) -> dict[str, Any]:
-    """What the scans of a drive follow from."""
+    """Parameters that determine the scans of a drive."""
     mounts = zip(drive.scenario.lidars, drive.further, strict=True)
     further = {mount.name: asdict(other.lidar) for mount, other in mounts}
     return {
@@ -162,7 +162,8 @@ def lidars_of(drive: SimulatedDrive, folder: Path) -> list[tuple[SimulatedDrive,
 def write_scans(
     drive: SimulatedDrive, folder: Path, on_scan: Callable[[int], None] | None = None, has_labels: bool = False
 ) -> int:
-    """Write the scans missing in `folder` as KITTI's .bin with times and rings beside. Returns the number of points of all.
+    """Write the scans missing in `folder` as KITTI's .bin, with times and rings in files beside. Returns the number of all
+    points.
 
     has_labels : with the classes of points
     `on_scan` is called with the index of every scan, in order, once the scans of all LiDARs are on disk.
@@ -230,14 +231,14 @@ def record(
 ) -> RecordingResult:
     """Trace all scans of `drive` and write `out`/sequences/00 and `out`/poses/00.txt.
 
-    The poses are of camera 0, as KITTI's; everything else in `out` is left alone. `on_scan` is called after each scan. What
-    is interrupted keeps its scans in `sequences/00.part`, and `resume` goes on there with the same bytes. Last comes the
-    sequence's `manifest.json`, with `command`, what was typed. `has_labels` adds the class of every point; `on_image` the images
-    of a camera, and is called after each.
+    The poses are of camera 0, as KITTI's; other files in `out` are not touched. `on_scan` is called after each scan. An
+    interrupted recording keeps its scans in `sequences/00.part`, and `resume` continues there with the same bytes. The
+    sequence's `manifest.json` is written last, with the command line `command`. `has_labels` adds the class of every point;
+    `on_image` the images of a camera, and is called after each.
 
     Raises
     ------
-    OutputExistsError : `out` holds something and neither `overwrite` nor `resume` is set, or what was begun is another drive
+    OutputExistsError : `out` is not empty and neither `overwrite` nor `resume` is set, or the unfinished drive is another one
     OutputError : `out` cannot be written, or the disk is too small
     """
     sequence, poses = out / "sequences" / NUMBER, out / "poses" / f"{NUMBER}.txt"

@@ -80,8 +80,8 @@ def penetrate(
 
     cast : first hits of rays on `mesh`, whose volumes are wound outwards; extinction : (surfaces,) 1/m, of volumes
 
-    A volume's transmission over x m is exp(-extinction x) (Ross 1981): the optical depth that a beam gets through is
-    exponential of mean 1. It is drawn for every ray of the scan, so what one ray meets does not change another's leaf.
+    A volume's transmission over x m is exp(-extinction x) (Ross 1981): the optical depth that a beam penetrates is
+    exponential of mean 1. It is drawn for every ray of the scan, so that rays are independent of each other's hits.
     """
     depth = rng.standard_exponential(len(hits.distance), np.float32)
     facing = rng.random(len(hits.distance), np.float32)
@@ -190,7 +190,7 @@ class Errors:
 
 
 def errors(returns: Returns, model: LidarModel, rays: Rays, hits: Hits, rng: np.random.Generator) -> Errors:
-    """Errors of the hits of `rays` of one scan, column after column."""
+    """Range errors and intensity gains of the hits of `rays` of one scan, column after column."""
     cosine: Array = np.clip(hits.cosine, np.float32(FLATTEST), np.float32(1)).astype(np.float32)
     distance: Array = np.where(np.isfinite(hits.distance), hits.distance, 0).astype(np.float32)
     slant: Array = (np.sqrt(1 - cosine**2) / cosine).astype(np.float32)

@@ -157,7 +157,7 @@ def _street(rng: np.random.Generator) -> Route:
 
 
 def _out_and_back(scenario: Scenario, scans: int | None) -> Route:
-    """Path of the scenario's length, or long enough to reach the speed and brake for the turn, or for `scans`."""
+    """Path of the scenario's length, extended so that it reaches its speed, brakes for the turn, and lasts for `scans`."""
     profile, path = speed_profile(scenario), scenario.path
     slow = min(profile.cruise, float(np.sqrt(profile.lateral * TURN_RADIUS_M)))
     speeding = (profile.cruise**2 - profile.start**2) / (2 * profile.acceleration)
@@ -194,12 +194,12 @@ def read_way_points(path: Path, origin: NDArray[Any] | None = None) -> WayPoints
     """Read way-points by the ending of the file: .toml, .csv, .geojson or .json; anything else is a trajectory.
 
     TOML has `points = [[x, y], ...]` and `closed = true`; CSV has x, y and perhaps z per line, m; GeoJSON has one LineString
-    or Polygon in degrees, x east and y north of `origin` (3,) lat, lon (deg), height (m), else of its first point. Of a
-    trajectory (KITTI, TUM, EuRoC) the level shape is taken, beginning along +x.
+    or Polygon in degrees, x east and y north of `origin` (3,) lat, lon (deg), height (m), else of its first point. For a
+    trajectory (KITTI, TUM, EuRoC) its horizontal shape is used, rotated to begin along +x.
 
     Raises
     ------
-    InputError naming the file and the place : missing, unreadable, unknown keys, fewer than three points
+    InputError naming the file and the position in it : missing, unreadable, unknown keys, fewer than three points
     """
     if not path.is_file():
         raise InputError(f"{path} does not exist: --path takes a trajectory or a file of way-points")
@@ -220,6 +220,7 @@ def _text(path: Path) -> str:
 
 
 def _from_toml(path: Path) -> WayPoints:
+    """Way-points of a TOML file; raises InputError."""
     try:
         tree = parse_toml(_text(path))
     except tomllib.TOMLDecodeError as error:
@@ -249,6 +250,7 @@ def _is_table(path: Path) -> bool:
 
 
 def _from_csv(path: Path) -> WayPoints:
+    """Way-points of a CSV file, with or without a header x,y or x,y,z; raises InputError."""
     rows = _rows(path)
     if rows and not _is_number(rows[0][0]):
         if [name.lower() for name in rows[0]] not in (["x", "y"], ["x", "y", "z"]):
@@ -266,6 +268,7 @@ def _is_number(text: str) -> bool:
 
 
 def _from_geojson(path: Path, origin: NDArray[Any] | None) -> WayPoints:
+    """Way-points of the only line or polygon of a GeoJSON file, m from `origin` or the first point; raises InputError."""
     try:
         tree = parse_json(_text(path))
     except ValueError as error:
@@ -289,6 +292,7 @@ def _from_geojson(path: Path, origin: NDArray[Any] | None) -> WayPoints:
 
 
 def _geometries(tree: Any) -> Any:
+    """All geometries of a GeoJSON document."""
     if not isinstance(tree, dict):
         return
     if tree.get("type") == "FeatureCollection":
@@ -301,6 +305,7 @@ def _geometries(tree: Any) -> Any:
 
 
 def _from_trajectory(path: Path) -> WayPoints:
+    """Way-points along the horizontal path of a trajectory file, `WAYPOINTS_APART_M` apart, rotated to begin along +x."""
     trajectory = read_trajectory(path)
     p = trajectory.positions
     # Camera 0 looks along z with x to the right.
@@ -317,6 +322,7 @@ def _from_trajectory(path: Path) -> WayPoints:
 
 
 def _array(path: Path, values: Any) -> Floats:
+    """(N, 2) or (N, 3) finite numbers; raises InputError naming the file for anything else."""
     try:
         points = np.array(values, np.float64)
     except MISFIT:

@@ -205,12 +205,12 @@ class TrafficSection(Section):
 class Scenario(Section):
     """A kind of place and a motion through it.
 
-    carrier : what carries the LiDAR; speed, start_speed : m/s, the latter of a drone nothing or all; lateral : greatest
-        acceleration in bends, m/s2, to which a car and a walker slow down and which a drone must not exceed, of eights the
-        greatest thrust; roof : m behind, ahead, aside and below the LiDAR that the car's own roof takes up, or nothing;
-        roof_returns : whether the roof is seen, or what it is in the way of is only missing
-    overlap : distance beyond one lap of a closed line, m; stand_s : s of standing before the drive
-    lidars : further LiDARs that ride along
+    carrier : car, walker or drone; speed, start_speed : m/s, the latter of a drone 0 or `speed`; lateral : greatest
+        acceleration in bends, m/s2: a car and a walker slow down to it, a drone must not exceed it, for the shape `eights` it
+        is the greatest thrust; roof : m behind, ahead, aside and below the LiDAR that the car's own roof occupies, or nothing;
+        roof_returns : whether the roof returns points, or rays to it are only lost
+    overlap : distance beyond one lap of a closed line, m; stand_s : s of standstill before the drive
+    lidars : further LiDARs on the same carrier
     """
 
     name: str
@@ -243,6 +243,7 @@ class Scenario(Section):
 
     @model_validator(mode="after")
     def _check_names(self) -> Scenario:
+        """Raise ValueError for unknown shapes and LiDARs, and for keys that contradict each other."""
         if self.path.shape not in LINES:
             raise ValueError(f"path.shape = {self.path.shape!r}; {nearest(self.path.shape, LINES)}")
         shape, own = self.path.shape, INDOORS.get(self.world.kind)
@@ -295,6 +296,7 @@ def _ready(name: str) -> dict[str, Any]:
 
 
 def _read_toml(path: Path) -> dict[str, Any]:
+    """Tree of a TOML file; raises InputError."""
     try:
         return parse_toml(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -304,9 +306,9 @@ def _read_toml(path: Path) -> dict[str, Any]:
 
 
 def parse_scenario(name: str, tree: dict[str, Any], settings: Iterable[str] = (), where: str | None = None) -> Scenario:
-    """Scenario of a TOML tree; with `base = "urban"` only differences from a ready scenario are needed.
+    """Scenario of a TOML tree; with `base = "urban"` it has only the differences from that ready scenario.
 
-    Raises ConfigError naming `where` it was found, the key and the nearest known one.
+    settings : "key=value", which override the tree. Raises ConfigError naming `where`, the key and the nearest known one.
     """
     where = where or f"scenario {name!r}"
     merged = _on_its_base(tree, where)
@@ -338,6 +340,7 @@ def _on_its_base(tree: dict[str, Any], where: str) -> dict[str, Any]:
 
 
 def _merge(tree: dict[str, Any], more: dict[str, Any], model: type[BaseModel], where: str, prefix: str) -> None:
+    """Override keys of `tree` by those of `more`; raises ConfigError naming `where` for keys that `model` lacks."""
     known = [key for key in model.model_fields if prefix or key != "name"]
     for key, value in more.items():
         if key not in known:

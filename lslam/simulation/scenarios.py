@@ -54,8 +54,8 @@ class MountedMotion:
 class SimulatedDrive(Scans):
     """A drive through a generated city; satisfies the `Sequence` protocol without touching the disk.
 
-    `ground_truth` is T_world_lidar at the scans' stamps, world = LiDAR at the first scan; `T_city_world` carries it into
-    the frame of `city`. Scans are traced when asked for, each with its own seed: any order gives the same bytes.
+    `ground_truth` is T_world_lidar at the scans' stamps, world = LiDAR at the first scan; `T_city_world` transforms it into
+    the frame of `city`. Scans are traced on demand, each with its own seed: any order gives the same bytes.
 
     further : the scans of other LiDARs on the same vehicle, in the order of the scenario, with truth and extrinsics of their own
     """
@@ -125,7 +125,7 @@ class SimulatedDrive(Scans):
         return self._motion.poses(self.stamps_ns / 1e9)
 
     def _beside(self, mount: LidarMount, number: int) -> SimulatedDrive:
-        """The drive as another LiDAR sees it, with noise of its own and without the roof."""
+        """The same drive recorded by another LiDAR, with its own noise and without the roof."""
         other, T, late_ns = copy.copy(self), mount.T_lidar_other, round(1e6 * mount.offset_ms)
         other.name, other.path = f"{self.name}-{mount.name}", Path(f"{self.name}-{mount.name}")
         other.lidar = self.lidar if mount.lidar is None else _with_ring_errors(find_lidar(mount.lidar), self.scenario)
@@ -205,26 +205,26 @@ def simulate(
 
     Parameters
     ----------
-    scenario : a name of `scenario_names()` or one's own; seed : of the city, the path and the noise, >= 0
+    scenario : a name of `scenario_names()` or a `Scenario`; seed : of the city, the path and the noise, >= 0
     lidar : a name of `LIDARS` or a model; count : scans (default: one lap, or to the end of the street; on a closed line
-        more scans mean more laps)
-    speed, start_speed : m/s, cruising and at the first scan (0: from rest); slower in bends that need it
+     more scans mean more laps)
+    speed, start_speed : m/s, cruising and at the first scan (0: from rest); lower in tight bends
     motion_compensated : False fires every column from its own pose and gives times per point; None: as the scenario says
-    settings : what to change in a scenario given by name, "world.relief=1"
-    way_points : a line, or a file of one, to take instead of the scenario's; the city is built round it
+    settings : overrides of a scenario given by name, "world.relief=1"
+    way_points : a line, or a file of one, instead of the scenario's; the city is built round it
     osm : an OpenStreetMap extract (XML or Overpass JSON) whose buildings are the city, x east and y north of the origin;
-        without `way_points` the drive goes along its streets
+     without `way_points` the drive goes along its streets
     origin : lat, lon (deg) and perhaps height (m) of the city's x = y = 0 (default: the middle of the extract's buildings,
-        else the first point of GeoJSON way-points, else a place of no meaning)
-    imu, gnss : an IMU (a name of `IMUS` or a model) and a receiver that ride along; wheels : of a car
-    static_start : s of standing before the drive begins, 0: as the scenario has it; its scans come on top of a default `count`
+     else the first point of GeoJSON way-points, else an arbitrary position)
+    imu, gnss : an IMU (a name of `IMUS` or a model) and a receiver on the carrier; wheels : of a car
+    static_start : s of standstill before the drive begins, 0: as in the scenario; its scans add to a default `count`
     visit : another drive through the same town: other traffic and noise, another start, the opposite direction
 
     Raises
     ------
-    UsageError : unknown names and keys, numbers out of range, more scans than the street is long, a path that no body could
-        take: through a building or the ground, or too sharp a bend
-    InputError : a file that is missing or broken, an extract without buildings or far from the path
+    UsageError : unknown names and keys, numbers out of range, more scans than the street is long, an impossible path:
+     through a building or the ground, or too sharp a bend
+    InputError : a file that is missing or damaged, an extract without buildings or far from the path
     """
     chosen = find_scenario(scenario, settings) if isinstance(scenario, str) else scenario
     model = chosen.lidar if lidar is None else lidar
@@ -295,6 +295,7 @@ def _with_ring_errors(model: LidarModel, scenario: Scenario) -> LidarModel:
 
 
 def _check(seed: int, count: int | None, speed: float, start_speed: float) -> None:
+    """Raise UsageError for a seed, number of scans or speed out of range."""
     if not 0 <= seed < 2**32:
         raise UsageError(f"--seed {seed} is out of range: 0 to {2**32 - 1}")
     if count is not None and count < 1:

@@ -163,7 +163,7 @@ class SimulatedWheels:
 def simulate_wheels(
     motion: Motion, model: WheelModel, T_lidar_base: Floats, end: float, rng: np.random.Generator
 ) -> SimulatedWheels:
-    """Readings of wheels at `T_lidar_base` (4, 4), from 0 to `end` s of `motion`; the same generator gives the same."""
+    """Readings of wheels at `T_lidar_base` (4, 4), from 0 to `end` s of `motion`; reproducible by the generator's state."""
     stamps = reading_stamps(model.rate_hz, end)
     scale, yaw_scale = rng.uniform(-1, 1, 2) * [model.scale, model.yaw_scale]
     yaw_offset = model.yaw_offset * rng.standard_normal()
@@ -181,7 +181,7 @@ def simulate_wheels(
 
 
 def _slip(model: WheelModel, times: Floats, end: float, rng: np.random.Generator) -> Floats:
-    """(M,) share of the speed by which wheels turn faster than they roll, at `times` (M,), s: half sines now and then."""
+    """(M,) relative excess of the wheels' speed at `times` (M,), s: half sines at random intervals."""
     slip = np.zeros(len(times))
     begin = float(rng.exponential(model.every))
     while begin < end:
@@ -235,9 +235,9 @@ class Readings:
 def read_sensors(
     motion: Motion, sensors: Sensors, carrier: str, end: float, seeds: tuple[int, ...], origin: Floats = ORIGIN
 ) -> Readings:
-    """Simulate the readings of `sensors` from 0 to `end` s of `motion`, each with a generator of its own.
+    """Simulate the readings of `sensors` from 0 to `end` s of `motion`, each by its own generator.
 
-    carrier : a key of `MOUNTS`, which says where they sit; what flies or is carried has no wheels
+    carrier : a key of `MOUNTS`, their mounting; drones and walkers have no wheels
     """
     mounts, imu, gnss, wheels = MOUNTS[carrier], None, None, None
     if sensors.imu is not None:
@@ -265,9 +265,9 @@ def write_readings(folder: Path, readings: Readings) -> None:
 def write_truth(folder: Path, motion: Motion, scan_stamps_ns: Longs, end: float, readings: Readings) -> None:
     """Write the exact truth into `folder`; readers of the sequence do not need it.
 
-    The world is the LiDAR at the first scan. `trajectory.tum` holds the LiDAR's poses at the scans' starts,
-    `trajectory_100hz.tum` at 100 Hz from 0 to `end` s; `kinematics.csv` its velocity in the world (m/s) and its rate in its own
-    frame (rad/s) at 100 Hz; `imu_bias.csv` the biases behind `imu.csv`; `world.toml` the world on the Earth.
+    The world is the LiDAR at the first scan. `trajectory.tum` has the LiDAR's poses at the scans' starts,
+    `trajectory_100hz.tum` at 100 Hz from 0 to `end` s; `motion.csv` its velocity in the world (m/s) and its rate in its own
+    frame (rad/s) at 100 Hz; `imu_bias.csv` the biases of `imu.csv`; `world.toml` the georeference and gravity.
     """
     folder.mkdir(parents=True, exist_ok=True)
     T_city_world = motion.poses(scan_stamps_ns[:1] / 1e9)[0]
@@ -288,6 +288,7 @@ def write_truth(folder: Path, motion: Motion, scan_stamps_ns: Longs, end: float,
 
 
 def _write_world(path: Path, T_enu_world: Floats, origin: Floats) -> None:
+    """Write world.toml: origin, T_enu_world and the gravity vector in the world."""
     down = np.array([0.0, 0.0, -GRAVITY])
     tree = {
         "origin_lat_lon_alt": origin.tolist(),

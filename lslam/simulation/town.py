@@ -89,7 +89,7 @@ class Places:
         self._taken = np.zeros((0, 2))
 
     def __call__(self, xy: Floats, offset: float, yaw: float) -> bool:
-        """Take the place (2,) of an object `offset` m from the middle of its street, if it is free; whether it was."""
+        """Whether an object at `xy` (2,), `offset` m from the axis of its street, has room; then it is recorded as occupied."""
         is_car = offset < self._road
         if self._network.distance(xy) < offset - (0.15 if is_car else 0.05):
             return False

@@ -302,6 +302,7 @@ class DebugConfig(Section):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
+        """Raise ValueError for keys that do not belong to the kind of drift."""
         are_given = bool(self.drift_estimate), bool(self.drift_truth)
         if self.drift_kind == "recorded" and not all(are_given):
             raise ValueError(

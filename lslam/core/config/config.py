@@ -144,7 +144,7 @@ def check_settings(settings: Iterable[str]) -> None:
 
 
 def _over_preset(tree: Tree) -> Tree:
-    """The tree laid over the preset it names; a preset's file is kept as a full path, so that a resolved copy finds it."""
+    """The tree merged over the preset it names; a preset's file is stored as an absolute path, so that a copy finds it."""
     name = str(tree.get("odometry", {}).get("preset", ""))
     if not name:
         return tree
@@ -155,7 +155,7 @@ def _over_preset(tree: Tree) -> Tree:
 
 
 def _whole(name: str, above: tuple[str, ...] = ()) -> Tree:
-    """A preset with the one that it names as its `base` under it."""
+    """A preset merged over the one that it names as its `base`; above : presets that led to it, to detect cycles."""
     if name in above:
         raise ConfigError(f"presets {', '.join(above)}: one cannot stand on itself")
     tree = read_preset(name)
@@ -175,7 +175,7 @@ def to_toml(config: Config) -> str:
 
 
 def to_described_toml(config: Config) -> str:
-    """As `to_toml`, every key on one line with its meaning; absent optional values are commented out."""
+    """The configuration as TOML, every key on one line with its description; absent optional values are commented out."""
     lines: list[str] = []
     for section in type(config).model_fields:
         values = getattr(config, section)
@@ -193,7 +193,7 @@ def _inline(value: Any) -> str:
 
 
 def _from_environment(environ: Mapping[str, str]) -> Tree:
-    """LSLAM_MAP_VOXEL=0.1 is map.voxel; variables that start with no section's name (LSLAM_DATA) mean something else."""
+    """Tree of the variables of the environment: LSLAM_MAP_VOXEL=0.1 is map.voxel; other variables (LSLAM_DATA) are ignored."""
     tree: Tree = {}
     for name in sorted(environ):
         if not name.startswith("LSLAM_"):
@@ -221,7 +221,10 @@ def setting_value(text: str) -> Any:
 
 
 def _merge(tree: Tree, more: Tree, where: str, *, is_file: bool = False) -> None:
-    """Lay `more` over the tree. A file may still say what is fixed, as the config.toml of an earlier run does."""
+    """Override keys of `tree` by those of `more`; raises ConfigError naming `where` for unknown ones.
+
+    is_file : accept former keys with their fixed value, as the config.toml of an earlier run has them
+    """
     for section, values in more.items():
         if section not in Config.model_fields:
             raise ConfigError(f"{where}: unknown section {section!r}; {nearest(section, Config.model_fields)}")
@@ -254,7 +257,7 @@ def _outcome(outcome: str = "", value: Any = None, instead: str = "") -> str:
 
 
 def explain(error: ValidationError, where: str = "configuration") -> str:
-    """One part per key: what was given and what is wanted, with the nearest of the words that are allowed."""
+    """Sentence with one part per key: the value, what is expected, and the nearest of the allowed words."""
     parts: dict[str, str] = {}
     found = error.errors()
     for e in found:

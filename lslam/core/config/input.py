@@ -144,6 +144,7 @@ class PreprocessConfig(Section):
 
     @model_validator(mode="after")
     def _check(self) -> PreprocessConfig:
+        """Raise ValueError for limits in the wrong order, and for an invalid box or direction."""
         self.require_order("range_min", "range_max")
         self.require_order("source_points_min", "source_points_max")
         box = self.ego_box

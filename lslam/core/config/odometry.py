@@ -168,6 +168,7 @@ class LoamConfig(Section):
 
     @model_validator(mode="after")
     def _check(self) -> LoamConfig:
+        """Raise ValueError if there are fewer less sharp edges than sharp ones."""
         if self.max_less_edge_points < self.max_edge_points:
             raise ValueError(
                 f"max_less_edge_points = {self.max_less_edge_points} must be at least max_edge_points = "
@@ -291,7 +292,7 @@ class FrontEndConfig(Section):
     @model_validator(mode="before")
     @classmethod
     def _with_needed_imu(cls, tree: Any) -> Any:
-        """A tightly coupled method cannot do without the IMU.
+        """Set `imu.use` for a tightly coupled method.
 
         >>> FrontEndConfig.model_validate({"odometry": {"method": "fast-lio2"}}).imu.use
         True

@@ -14,7 +14,7 @@ FINEST_M = 0.01
 
 
 def parse_attributes(value: Any) -> tuple[str, ...]:
-    """Attributes of points from a list, or from text with commas between. Raises ValueError for one that is unknown.
+    """Attributes of points from a list, or from text separated by commas. Raises ValueError for unknown ones.
 
     >>> parse_attributes("time, ring")
     ('time', 'ring')
@@ -67,6 +67,7 @@ class MapConfig(Section):
 
     @model_validator(mode="after")
     def _check(self) -> MapConfig:
+        """Raise ValueError for limits in the wrong order, invalid boxes, and keys that need voxels without them."""
         self.require_order("range_min", "range_max")
         self.require_order("range_min", "occupancy_range")
         if 0 < self.voxel < FINEST_M:

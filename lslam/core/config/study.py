@@ -90,6 +90,7 @@ class ExpectedFinding(Section):
 
     @model_validator(mode="after")
     def _fit_kind(self) -> Self:
+        """Raise ValueError for values or stages that do not fit the kind."""
         least, most = _COUNTS[self.kind]
         if not least <= len(self.values) <= most:
             wanted = f"{least}" if least == most else f"{least} or {most}"
@@ -126,6 +127,7 @@ class Range(Section):
 
     @model_validator(mode="after")
     def _check(self) -> Range:
+        """Raise ValueError for an empty, ambiguous or too long range."""
         if self.stop < self.start:
             raise ValueError(f"the range from {self.start} to {self.stop} is empty: stop lies below start")
         if (self.step is None) == (self.num is None):
@@ -137,7 +139,7 @@ class Range(Section):
         return self
 
     def _is_short(self) -> bool:
-        """Counted before anything is built; numbers beyond those of the machine are too many as well."""
+        """Whether the range has at most `MOST_VALUES` values, computed without building it."""
         if self.num is not None:
             return self.num <= MOST_VALUES
         assert self.step is not None
@@ -147,7 +149,7 @@ class Range(Section):
             return False
 
     def values(self) -> tuple[int | float, ...]:
-        """All of them; whole numbers when both ends are.
+        """All values, ascending; integers when both ends are.
 
         >>> Range(start=0.1, stop=0.3, step=0.1).values()
         (0.1, 0.2, 0.3)
@@ -184,6 +186,7 @@ class StudySequence(ScanRange):
 
     @model_validator(mode="after")
     def _check(self) -> StudySequence:
+        """Raise ValueError unless exactly one of path and scenario is set, and for a scenario's keys with a path."""
         if bool(self.path) == bool(self.scenario):
             raise ValueError("a sequence is a path or a scenario: give one of them")
         more = ", ".join(sorted(self.model_fields_set - {"path", "scenario", *ScanRange.model_fields}))
@@ -220,7 +223,7 @@ class StudyConfig(Section):
     @field_validator("parameters", mode="before")
     @classmethod
     def _flatten(cls, tree: Any) -> Any:
-        """`input.skip_frames = [...]` is a table in a table for TOML."""
+        """Join nested tables: TOML reads `input.skip_frames = [...]` as a table in a table."""
         if not isinstance(tree, dict):
             return tree
         flat: dict[str, Any] = {}
@@ -236,6 +239,7 @@ class StudyConfig(Section):
     def _has_values(
         cls, parameters: dict[str, Range | tuple[Value, ...]], info: ValidationInfo
     ) -> dict[str, Range | tuple[Value, ...]]:
+        """Raise ValueError for a parameter without values, with duplicates, or that a sequence sets itself."""
         for sequence in info.data.get("sequences", ()):
             for key in sequence.own:
                 if f"input.{key}" in parameters:
@@ -256,7 +260,7 @@ class StudyConfig(Section):
     @field_validator("finding")
     @classmethod
     def _speak_of_runs(cls, findings: tuple[ExpectedFinding, ...], info: ValidationInfo) -> tuple[ExpectedFinding, ...]:
-        """What names a key or a method that is not there would never be judged."""
+        """Raise ValueError for a finding about a key or a method that is not studied."""
         keys, words = info.data.get("parameters", {}), info.data.get("methods", ())
         labels = [Path(word).stem if word.endswith(".toml") else word for word in words]
         for finding in findings:
@@ -300,7 +304,7 @@ def read_study(path: Path) -> StudyConfig:
 
 
 def parse_study(tree: dict[str, Any], where: str, name: str) -> StudyConfig:
-    """The study of a TOML tree found in `where`; `name` is what it is called when it does not say."""
+    """The study of a TOML tree read from `where`; `name` is its name if the tree has none. Raises ConfigError."""
     check_keys(tree, StudyConfig, where)
     for sequence in tables(tree.get("sequences")):
         check_keys(sequence, StudySequence, f"{where}: sequences")
@@ -359,7 +363,7 @@ def read_batch(path: Path) -> BatchConfig:
 
 
 def parse_batch(tree: dict[str, Any], where: str) -> BatchConfig:
-    """The batch of a TOML tree found in `where`; raises ConfigError as `read_batch`."""
+    """The batch of a TOML tree read from `where`; raises ConfigError as `read_batch`."""
     check_keys(tree, BatchConfig, where)
     for job in tables(tree.get("jobs")):
         check_keys(job, BatchJob, f"{where}: jobs")

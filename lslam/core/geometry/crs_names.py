@@ -7,7 +7,7 @@ from lslam.core.untrusted import whole_number
 
 
 def parse_crs(text: str) -> tuple[int, int | None]:
-    """The codes of `EPSG:25832` or `EPSG:25832+7837`, of a vertical one the second; raises UsageError on anything else."""
+    """The horizontal and vertical (or None) code of `EPSG:25832` or `EPSG:25832+7837`; raises UsageError for other text."""
     name, _, digits = text.strip().partition(":")
     plane, plus, height = digits.partition("+")
     codes = whole_number(plane), whole_number(height.strip().upper().removeprefix("EPSG:"))

@@ -55,9 +55,9 @@ def frame_change(old: NDArray[Any], new: NDArray[Any]) -> Floats:
 
 
 def installed_grids() -> dict[str, Any]:
-    """What PROJ has on this machine: its version, folders, whether it asks the network, and grids by their purpose.
+    """PROJ on this machine: version, folders, whether it may use the network, and installed grids by purpose.
 
-    `vertical` are those of heights by PROJ's own list, `others` those of positions and of no list.
+    `vertical` are grids of heights by PROJ's database, `others` those of positions and unlisted ones.
     """
     import sqlite3
     from contextlib import closing
@@ -88,7 +88,7 @@ def installed_grids() -> dict[str, Any]:
 
 
 def crs_of(epsg: int, height_epsg: int | None = None) -> Any:
-    """pyproj's `CRS` of these codes; raises UsageError for what PROJ does not know."""
+    """pyproj's `CRS` of these codes; raises UsageError for codes that PROJ does not know."""
     from pyproj import CRS
     from pyproj.exceptions import CRSError
 
@@ -107,9 +107,9 @@ def has_heights(crs: Any) -> bool:
 
 
 def exact_transformer(source: Any, target: Any, lat_lon: NDArray[Any], name: str) -> Any:
-    """pyproj's best operation between two coordinate reference systems at places (N, 2) lat, lon, deg.
+    """pyproj's most accurate transformer between two coordinate reference systems at positions (N, 2) lat, lon, deg.
 
-    Ballpark operations, which leave the geoid out, are never taken, nor is a coarser one where the best lacks a grid: raises
+    Ballpark operations, which ignore the geoid, are never used, nor is a coarser one if the best lacks a grid: raises
     UsageError with the grid's name.
     """
     from pyproj.aoi import AreaOfInterest
@@ -144,9 +144,9 @@ def exact_transformer(source: Any, target: Any, lat_lon: NDArray[Any], name: str
 
 
 def geoid_heights(geoid: str, lat_lon: NDArray[Any]) -> Floats:
-    """(N,) m, the geoid above the WGS84 ellipsoid at (N, 2) lat, lon, deg, by a grid (GTX, GeoTIFF).
+    """(N,) m, heights of the geoid above the WGS84 ellipsoid at (N, 2) lat, lon, deg, by a grid file (GTX, GeoTIFF).
 
-    Raises UsageError when PROJ cannot read it, or where it ends.
+    Raises UsageError when PROJ cannot read it, or outside of its area.
     """
     from pyproj import Transformer
     from pyproj.exceptions import ProjError

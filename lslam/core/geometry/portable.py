@@ -139,7 +139,7 @@ def tan(x: Any) -> Any:
 
 
 def sine_cosine(x: Any) -> tuple[Any, Any]:
-    """Sine and cosine at once, for half of the cost of both."""
+    """Sine and cosine of angles, rad, computed together at half the cost of both."""
     angle = np.asarray(x, np.float64)
     if angle.size <= _FEW:
         both = np.array([sine_cosine_of(float(value)) for value in angle.ravel()]).reshape(-1, 2)
@@ -213,6 +213,7 @@ def _of(x: Any, function: Any) -> Any:
 
 
 def _sine_cosine(x: Array) -> tuple[Array, Array]:
+    """Sine and cosine of an array, in blocks that fit the cache."""
     if x.size <= _BLOCK:
         return _sine_cosine_block(x)
     out = np.empty((2, x.size))
@@ -223,6 +224,7 @@ def _sine_cosine(x: Array) -> tuple[Array, Array]:
 
 
 def _sine_cosine_block(x: Array) -> tuple[Array, Array]:
+    """Sine and cosine after reduction of the angles to pi/4 about multiples of pi/2."""
     turns = np.rint(np.where(np.isfinite(x), x, 0.0) * _TWO_OVER_PI)
     r, tail = _reduce(x, turns)
     s, c = _kernels(r, tail)
@@ -233,7 +235,7 @@ def _sine_cosine_block(x: Array) -> tuple[Array, Array]:
 
 
 def sine_cosine_of(x: float) -> tuple[float, float]:
-    """The same operations on plain floats, with the same results."""
+    """Sine and cosine of one angle, rad, by plain floats, with the same bits as `sine_cosine`."""
     if x - x != 0:
         return np.nan, np.nan
     turns = float(round(x * _TWO_OVER_PI))
@@ -270,7 +272,7 @@ def _kernels(r: Any, tail: Any) -> tuple[Any, Any]:
 
 
 def _arctangent(x: Array) -> Array:
-    """Of x >= 0, infinity included."""
+    """Arctangent, rad, of an array x >= 0, infinity included."""
     knot = np.searchsorted(_KNOT_EDGES, x, side="right")
     with np.errstate(invalid="ignore", divide="ignore"):
         t = np.select(
@@ -283,7 +285,7 @@ def _arctangent(x: Array) -> Array:
 
 
 def _arctangent_of(x: float) -> float:
-    """The same operations on a plain float, with the same result."""
+    """Arctangent of one number x >= 0 by plain floats, with the same bits as `_arctangent`."""
     knot = bisect_right(_KNOTS, x)
     match knot:
         case 0:
@@ -309,6 +311,7 @@ def _horner(z: Any, coefficients: tuple[float, ...]) -> Any:
 
 
 def _exponential(x: Array) -> Array:
+    """exp(x) of an array, by reduction to a power of 2 and a rational approximation."""
     x = np.clip(x, -750.0, 710.0)
     halvings = np.rint(x / _LN2_HIGH)
     high, low = x - halvings * _LN2_HIGH, halvings * _LN2_LOW
@@ -320,6 +323,7 @@ def _exponential(x: Array) -> Array:
 
 
 def _logarithm(x: Array) -> Array:
+    """Natural logarithm of an array of positive numbers."""
     mantissa, exponent = np.frexp(x)
     is_low = mantissa < np.sqrt(0.5)
     f = np.where(is_low, 2 * mantissa, mantissa) - 1

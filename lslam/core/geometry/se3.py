@@ -58,7 +58,7 @@ def relative(T_a: NDArray[Any], T_b: NDArray[Any]) -> Floats:
 
 
 def _relative_of(T_a: Floats, T_b: Floats) -> Floats:
-    """The same operations on plain floats, with the same results: a quarter of the time for one pair of poses."""
+    """inv(T_a) T_b of two single poses by plain floats, with the same bits as `relative`, in a quarter of the time."""
     (a, b, c, x), (d, e, f, y), (g, h, i, z) = T_a[:3].tolist()
     p, q, r, last = T_b.tolist()
     inverse_rows = ((a, d, g), (b, e, h), (c, f, i))
@@ -90,6 +90,7 @@ def adjoint(T: NDArray[Any]) -> Floats:
 
 
 def _left_jacobian(phi: Floats) -> Floats:
+    """(..., 3, 3) left Jacobian of SO(3) at rotation vectors (..., 3), rad."""
     if phi.ndim == 1:
         return _left_jacobian_of(*phi.tolist())
     theta2 = np.sum(phi * phi, axis=-1)[..., None, None]
@@ -103,7 +104,7 @@ def _left_jacobian(phi: Floats) -> Floats:
 
 
 def _left_jacobian_of(x: float, y: float, z: float) -> Floats:
-    """The same operations on plain floats, with the same results."""
+    """Left Jacobian of one rotation vector by plain floats, with the same bits as `_left_jacobian`."""
     theta2 = x * x + y * y + z * z
     if theta2 < 1e-8:
         return so3.polynomial(x, y, z, 0.5 - theta2 / 24, 1 / 6 - theta2 / 120)
@@ -113,7 +114,7 @@ def _left_jacobian_of(x: float, y: float, z: float) -> Floats:
 
 
 def _inverse_left_jacobian(phi: Floats) -> Floats:
-    """Of rotation vectors (..., 3) of angles up to pi (Barfoot 2017, equation 7.37b)."""
+    """(..., 3, 3) inverse left Jacobian of rotation vectors (..., 3) of angles up to pi (Barfoot 2017, equation 7.37b)."""
     if phi.ndim == 1:
         return _inverse_left_jacobian_of(*phi.tolist())
     theta2 = np.sum(phi * phi, axis=-1)[..., None, None]
@@ -126,7 +127,7 @@ def _inverse_left_jacobian(phi: Floats) -> Floats:
 
 
 def _inverse_left_jacobian_of(x: float, y: float, z: float) -> Floats:
-    """The same operations on plain floats, with the same results."""
+    """Inverse left Jacobian of one rotation vector by plain floats, with the same bits as `_inverse_left_jacobian`."""
     theta2 = x * x + y * y + z * z
     if theta2 < 1e-4:
         return so3.polynomial(x, y, z, -0.5, 1 / 12 + theta2 / 720 + theta2 * theta2 / 30240)
@@ -143,10 +144,10 @@ def turns_between(a: Floats, b: Floats) -> Floats:
 def poses_at(
     stamps_ns: NDArray[np.int64], poses: Floats, query_ns: NDArray[Any], turns: Floats | None = None
 ) -> Floats:
-    """Poses (M, 4, 4) at `query_ns` (M,) from increasing `stamps_ns` (N,) and `poses` (N, 4, 4), N >= 2.
+    """Poses (M, 4, 4) at `query_ns` (M,) interpolated between increasing `stamps_ns` (N,) with `poses` (N, 4, 4), N >= 2.
 
-    turns : (N - 1, 3) `turns_between` successive poses, of a caller that asks often
-    Queries outside the stamps extrapolate the first or last segment: the caller decides how far that is wise.
+    turns : (N - 1, 3) `turns_between` successive poses, if the caller has them
+    Queries outside the stamps extrapolate the first or last segment: the caller decides how far.
     """
     stamps = np.asarray(stamps_ns, np.int64)
     query = np.asarray(query_ns, np.int64)
@@ -187,10 +188,10 @@ def umeyama(source: NDArray[Any], target: NDArray[Any], with_scale: bool = False
 class ContinuousMotion:
     """Motion through poses by cubic splines, in rotation those of Kang and Park (1999).
 
-    A straight line between two poses would cut the swing of a hand: at 2 Hz and 10 scans a second by a fifth.
+    Straight lines between poses would cut the swing of a hand: at 2 Hz and 10 scans a second by a fifth.
 
-    stretches : stamps (N,), ns, increasing, and poses (N, 4, 4), N >= 2, of each; shorter ones are left out. Nothing is known
-        between two of them
+    stretches : stamps (N,), ns, increasing, and poses (N, 4, 4), N >= 2, of each; shorter ones are left out. Between two of
+        them the motion is unknown
     """
 
     def __init__(self, stretches: Iterable[tuple[Stamps, Floats]]) -> None:

@@ -15,7 +15,7 @@ log = logging.getLogger("lslam")
 def cache_folder(name: str) -> Path | None:
     """The folder `name` of the user's XDG cache, or of the temporary directory when the home cannot be written.
 
-    None, and a warning, when neither folder belongs to the user alone.
+    None, with a warning, when neither folder belongs to the user alone.
     """
     base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     shared = Path(tempfile.gettempdir()) / f"lslam-cache-{os.getuid() if hasattr(os, 'getuid') else 0}"
@@ -34,8 +34,8 @@ def cache_folder(name: str) -> Path | None:
 def own_folder(folder: Path) -> Path:
     """Make the folder with access for the user alone, or check that an existing one belongs to the user.
 
-    In a folder where others can write, as /tmp, it may neither be a link nor be writable for a group. Elsewhere a link of the
-    user's is followed, and a group's permission to write, which a umask of 002 gives, is removed.
+    In a directory that others can write to, as /tmp, it may neither be a link nor be group-writable. Elsewhere a link of the
+    user's is followed, and group write permission, which a umask of 002 gives, is removed.
 
     Raises OSError; a PermissionError without a file name when the folder is not the user's own.
     """
@@ -70,7 +70,7 @@ def source_digest() -> str:
 
 
 def kernel_folder() -> Path | None:
-    """Folder of the machine code; None, and a warning, when there is no safe one."""
+    """Folder of the machine code; None, with a warning, when there is no safe one."""
     base, own = os.environ.get("NUMBA_CACHE_DIR"), source_digest()
     if base is None:
         folder = cache_folder("numba")

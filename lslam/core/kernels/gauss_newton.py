@@ -27,7 +27,7 @@ def solve_guarded_step(
     """Step d = -inv(H) g, (6,) m and rad, in the observed directions; returns the number of degenerate ones, rows of `weak`.
 
     Rotations are scaled by the rms lever arm, m, which makes the six eigenvalues comparable. A direction is degenerate when
-    its eigenvalue is less than `weak_share` of the total information or less than `least`, 1/m2. It is left out of the step
+    its eigenvalue is less than `weak_share` of the total information or less than `least`, 1/m2. It is excluded from the step
     below `unseen` times that threshold: solution remapping (Zhang, Kaess and Singh 2016).
     """
     lever = math.sqrt(max(facts[LEVER] / max(facts[INFORMATION], 1e-300), 1e-6))
@@ -107,7 +107,7 @@ def scale_by_population(H: Floats, S: Floats, g: Floats, facts: Floats) -> None:
 
 @inline_with_arrays
 def within(projector: Floats, H: Floats) -> Floats:
-    """A H A, the information (6, 6) along the directions on which A = `projector` (6, 6) projects; H where it has no rows."""
+    """Projected information A H A (6, 6), A = `projector` (6, 6); H itself for a projector without rows."""
     if len(projector) == 0:
         return H
     A = np.zeros((6, 6))
@@ -134,9 +134,9 @@ def step(
 ) -> tuple[bool, int, float, float]:
     """Move the pose by one step in the observed directions, and write the step to d (6,), m and rad.
 
-    sums : of a linearisation; H has its upper triangle alone, and is filled in
+    sums : of a linearisation; of H only the upper triangle is needed, the lower one is filled in
     scale : width of the robust kernel, m
-    limits : `weak_share`, `least` and `unseen` of `solve_observed`
+    limits : `weak_share`, `least` and `unseen` of `solve_guarded_step`
     projector : (6, 6) on the directions that may be estimated; (0, 6) allows all
     weak : (6, 6), whose first rows become the degenerate directions
 
@@ -155,7 +155,7 @@ def step(
 def step_on_surfaces(
     pose: Pose, sums: Sums, scale: float, limits: Limits, projector: Floats, d: Floats, weak: Floats
 ) -> tuple[bool, int, float, float]:
-    """As `step`, with degenerate directions by S; a kernel of its own, so that runs of other residuals need not compile it."""
+    """Like `step`, with degenerate directions by S; a separate kernel, so that runs of other residuals need not compile it."""
     R, t = pose
     H, S, g, facts = sums
     make_whole(sums)
@@ -167,9 +167,9 @@ def step_on_surfaces(
 
 @kernel
 def trimming_distance2(away2: Floats, share: float, gate2: float) -> float:
-    """Squared distance, m2, within which `share` of the matched points within `gate2` lie: that quantile of `away2` (S,).
+    """Quantile `share` of the squared distances `away2` (S,), m2, of the matched points within `gate2`.
 
-    Unmatched points have a negative distance. Bisection needs no copy and no sort, and is the same for any order of points.
+    Unmatched points have a negative distance. Bisection needs no copy and no sort, and is independent of the points' order.
     """
     if share >= 1.0:
         return gate2

@@ -45,7 +45,7 @@ def find(key: int, keys: Longs, table: Ints) -> int:
 def _claim(
     key: int, moments: Floats, planes: Floats, keys: Longs, counts: Floats, table: Ints, state: Longs, free: Ints
 ) -> int:
-    """Slot of a key, taking a fresh one when it is new; -1 when the pool is full."""
+    """Slot of the voxel `key`, a new one if it is not in the map; -1 when the pool is full."""
     h = place_of(key, keys, table)
     if table[h] >= 0:
         return int(table[h])
@@ -68,7 +68,7 @@ def _claim(
 
 @inline
 def _release(slot: int, keys: Longs, table: Ints, state: Longs, free: Ints, planes: Floats) -> None:
-    """Give a slot back; the entries that follow it in the table move up, so that no tombstones gather."""
+    """Free a slot; the entries that follow it in the hash table move up, so that no tombstones accumulate."""
     mask = len(table) - 1
     h = hash_key(keys[slot], mask)
     while table[h] != slot:
@@ -102,11 +102,11 @@ def _refresh(
     common: float,
     breadth: float,
 ) -> None:
-    """Mean, normal and kind of one voxel, its row of `planes`, from its moments.
+    """Recompute the row of `planes` of one voxel from its moments: mean, normal, variance, and kind.
 
     The points of one ring of one scan lie on the cone of its beams, and those of the next scan lie on the same cone wherever
-    the sensor has moved: they observe the sensor, not a surface. A voxel of such points is `EMPTY`. A voxel counts when the
-    variance of its points across the beams is at least `breadth` times that of the surface; `breadth` = 0 turns this off.
+    the sensor has moved: they reflect the scan pattern, not a surface. A voxel of such points is `EMPTY`. A voxel is valid when
+    the variance of its points across the beams is at least `breadth` times that of the surface; `breadth` = 0 disables this.
     """
     s = moments[slot]
     n = s[0]
@@ -145,9 +145,9 @@ def _refresh(
 def breadth_of(
     xx: float, xy: float, xz: float, yy: float, yz: float, zz: float, dx: float, dy: float, dz: float
 ) -> float:
-    """Smaller variance, m2, of points of covariance xx..zz across the direction d of the beams that measured them.
+    """Smaller variance, m2, of points of covariance xx..zz perpendicular to the direction d of the beams that measured them.
 
-    The smaller eigenvalue of the covariance projected along d. It is the variance about the best plane that holds d.
+    It is the smaller eigenvalue of the covariance projected along d: the variance about the best plane that contains d.
     """
     d2 = dx * dx + dy * dy + dz * dz
     if d2 < 1e-12:
@@ -187,7 +187,7 @@ def insert(
     """Add points (N, 3), LiDAR frame, m, measured from the pose R (3, 3), t (3,); returns the number that found no slot.
 
     Moments of a voxel with more than `cap` points are scaled down, so that new points keep their weight. A voxel's plane is
-    computed again when its count has grown by a tenth. For every voxel touched, the clock hand examines two slots and frees
+    recomputed when its count has grown by a tenth. For every inserted point, the clock hand examines two slots and frees
     those farther than `reach`, m, from t.
     """
     n = len(points)
@@ -272,6 +272,7 @@ def insert(
 def _evict(
     steps: int, t: Floats, size: float, reach: float, keys: Longs, table: Ints, state: Longs, free: Ints, planes: Floats
 ) -> None:
+    """Advance the clock hand by `steps` slots and free those farther than `reach`, m, from t (3,)."""
     if state[USED] == 0:
         return
     far = reach * reach

@@ -22,7 +22,7 @@ def cell_of(x: float, y: float, inverse: float, half: int) -> int:
 
 @kernel
 def lowest(points: NDArray[np.float32], R: NDArray[np.float64], cell: float, half: int) -> NDArray[np.int64]:
-    """Index of the lowest point of each cell, -1 where there is none: (4 half^2,)."""
+    """Index (4 half^2,) of the lowest point, after rotation by R, in each cell of `cell` m; -1 for empty cells."""
     found, height = np.empty(4 * half * half, np.int64), np.empty(4 * half * half)
     found[:] = -1
     height[:] = NO_HEIGHT
@@ -43,10 +43,10 @@ def lowest(points: NDArray[np.float32], R: NDArray[np.float64], cell: float, hal
 def best_plane(
     points: NDArray[np.float64], triples: NDArray[np.int64], tolerance: float, upright: float
 ) -> NDArray[np.float64]:
-    """Plane n x, n y, n z, d (n p + d = 0, n upwards) through one of the triples (K, 3), or zeros when none will do.
+    """Plane n x, n y, n z, d (n p + d = 0, n upwards) through one of the triples (K, 3), or zeros when none is valid.
 
-    The best has most points (N, 3) within `tolerance` above or below, less those farther below: nothing lies under the
-    ground. Planes with n z under `upright` are left out.
+    The best has the highest number of points (N, 3) within `tolerance`, minus those below it: nothing lies under the
+    ground. Planes with n z under `upright` are excluded.
     """
     best = np.zeros(4)
     best_score = 2
@@ -78,10 +78,10 @@ def best_plane(
 
 @kernel
 def envelope(height: NDArray[np.float64], rise: float, tolerance: float) -> NDArray[np.float64]:
-    """Highest ground that each cell of `height` (n, n) can have: the lowest cone, `rise` m per cell, over any cell.
+    """Highest possible ground in each cell of `height` (n, n): the lowest cone, rising `rise` m per cell, over any cell.
 
-    A cell carries a cone when at least a quarter of the cells within two of it, one or more, lie as low: reflections from
-    under the road are few beside it. The distance is that of steps to the eight neighbours: two sweeps, at most 8 %
+    A cell supports a cone when at least a quarter of the cells within two of it, one or more, are as low: reflections from
+    under the road have few neighbours. The distance is that of steps to the eight neighbours: two sweeps, at most 8 %
     longer than the straight line.
     """
     n = len(height)
@@ -138,7 +138,7 @@ def above(
     top: NDArray[np.float64],
     tolerance: float,
 ) -> NDArray[np.int64]:
-    """Indices of the points more than `tolerance` over the ground `top` (2 half, 2 half); outside the grid all are."""
+    """Indices of the points more than `tolerance` over the ground `top` (2 half, 2 half), and of all outside of the grid."""
     kept = np.empty(len(points), np.int64)
     count = 0
     inverse = 1.0 / cell

@@ -34,7 +34,7 @@ def _numba(module: str) -> Any:
 
 
 def compare_set_flags() -> None:
-    """Flags that were set alike are equal, without a look at the fifty defaults of each."""
+    """Speed up numba: flags with equal explicit values compare equal without a comparison of all defaults."""
     flags = _numba("core.targetconfig").TargetConfig
     compare = flags.__eq__
 
@@ -46,7 +46,7 @@ def compare_set_flags() -> None:
 
 
 def remember_signatures() -> None:
-    """A call, `a + b` of two doubles for one, is resolved once for its types, not at each place and in each round."""
+    """Speed up numba: cache the resolution of a call for its argument types, instead of resolving it at each use."""
     function, stack = _numba("core.types.functions").BaseFunction, _numba("core.targetconfig").ConfigStack
     resolve, flags = function.get_call_type, stack.top_or_none
 
@@ -63,7 +63,7 @@ def remember_signatures() -> None:
 
 
 def emit_entry_points() -> None:
-    """Machine code is made of what Python calls. Functions compiled into others stay LLVM's, and are linked as that."""
+    """Speed up numba: emit machine code only for functions that Python calls; others remain LLVM modules and are linked."""
     context, make_function = _numba("core.cpu").CPUContext, _numba("_dynfunc").make_function
     make = context.get_executable
 
@@ -86,7 +86,7 @@ def _defines(module: Any, name: str) -> bool:
 
 
 def find_lifetimes_late() -> None:
-    """Lifetimes of variables are found when they are asked for, by the last pass of twenty, not after each."""
+    """Speed up numba: compute the lifetimes of variables only in the last pass, which needs them."""
     processor, lifetimes = _numba("core.postproc").PostProcessor, _numba("core.postproc").VariableLifetime
     process, in_order = processor.run, _numba("core.transforms").canonicalize_cfg
 

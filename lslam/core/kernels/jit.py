@@ -84,7 +84,7 @@ def kernel(function: F) -> F:
 def _share(dispatcher: Any) -> None:
     """Let one process compile a kernel while others that need it wait, and then load it.
 
-    A damaged or full cache means to compile again: numba passes on every error of unpickling and writing.
+    With a damaged or full cache the kernel is compiled again, since numba ignores errors of reading and writing.
     """
     cache, held = dispatcher._cache, contextlib.ExitStack()
     save, name = cache.save_overload, dispatcher.py_func.__qualname__
@@ -167,7 +167,7 @@ def _compile_inline(function: F, **more: bool) -> F:
 
 @contextlib.contextmanager
 def announce_compiling(log: logging.Logger, on_first: Callable[[], None] = lambda: None) -> Iterator[None]:
-    """Log a line when the first kernel is compiled within the block, and call `on_first`; loading kernels does neither."""
+    """Log a line when the first kernel is compiled inside the block, and call `on_first`; loading kernels does neither."""
 
     def announce() -> None:
         log.info(
@@ -183,9 +183,9 @@ def announce_compiling(log: logging.Logger, on_first: Callable[[], None] = lambd
 
 @contextlib.contextmanager
 def count_kernels(log: logging.Logger, total: int | None, every_s: float = 2.0) -> Iterator[None]:
-    """Log, every now and then within the block, which kernel is compiled, and how many are ready; `total` : of how many.
+    """Log, at most every `every_s` s inside the block, which kernel is being compiled, and how many of `total` are ready.
 
-    Loading says nothing.
+    Loading from the cache is not logged.
     """
     done, last = 0, -math.inf
 

@@ -163,7 +163,7 @@ def add_matrix(
 
 @inline
 def add_gradient(g: Floats, px: float, py: float, pz: float, rx: float, ry: float, rz: float) -> None:
-    """g += J^T p, with J as above and p = M e summed over the matches."""
+    """g += J^T p, with J = [I, -hat(r)] and p = M e summed over the matches."""
     g[0] += px
     g[1] += py
     g[2] += pz
@@ -206,7 +206,7 @@ def rotate_symmetric(R: NDArray[np.float64], q: NDArray[np.float64]) -> tuple[fl
 
 @inline
 def extent(values: NDArray[Any]) -> tuple[Any, Any]:
-    """Least and greatest of the values (N,), N > 0; both are NaN when a value is NaN, as in NumPy."""
+    """Minimum and maximum of the values (N,), N > 0; both are NaN when a value is NaN, as in NumPy."""
     low = high = values[0]
     for value in values:
         # Only NaN differs from itself. No value compares as smaller or larger than NaN, so that it stays.
@@ -222,7 +222,7 @@ def extent(values: NDArray[Any]) -> tuple[Any, Any]:
 # without changing the order of sums. The result of a matrix that is not positive definite is NaN.
 @inline
 def _factorise(A: Floats, scale: Floats, L: Floats, column: Floats) -> None:
-    """L (N, N) lower triangular with L L^T = S A S, S = diag(`scale`) (N,), which is found first."""
+    """Cholesky factor: L (N, N) lower triangular with L L^T = S A S; the scaling S = diag(`scale`) (N,) is computed first."""
     n = len(A)
     for i in range(n):
         scale[i] = 1.0 / math.sqrt(A[i, i])
@@ -243,7 +243,7 @@ def _factorise(A: Floats, scale: Floats, L: Floats, column: Floats) -> None:
 
 @kernel
 def inverse(A: Floats) -> Floats:
-    """Inverse (N, N) of A (N, N), symmetric to the last bit."""
+    """Inverse (N, N) of the positive definite A (N, N), exactly symmetric."""
     n = len(A)
     scale, L, column, W = np.empty(n), np.zeros((n, n)), np.empty(n), np.zeros((n, n))
     _factorise(A, scale, L, column)
@@ -294,7 +294,7 @@ def complement(A: Floats, B: Floats, C: Floats) -> Floats:
 
 @kernel
 def solve(A: Floats, b: Floats) -> Floats:
-    """Solution x (N,) of A x = b with A (N, N) and b (N,)."""
+    """Solution x (N,) of A x = b with A (N, N) positive definite and b (N,), by Cholesky factorisation."""
     n = len(b)
     scale, L, column, x = np.empty(n), np.zeros((n, n)), np.empty(n), np.empty(n)
     _factorise(A, scale, L, column)

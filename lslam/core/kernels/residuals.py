@@ -58,7 +58,7 @@ def add_facts(facts: Floats, information: float, square: float, robust: float, r
 def octant_slots(
     x: float, y: float, z: float, i: int, inverse: float, cells: Longs, slots: Ints, keys: Longs, table: Ints
 ) -> bool:
-    """Look up the slots (8,) of the voxels around point i at x, y, z, world, when it has left its octant cell; True then."""
+    """Look up the slots (8,) of the voxels around point i at x, y, z, world; True when it has left its octant cell."""
     ix, iy, iz = (
         index_of(x - 0.5 / inverse, inverse),
         index_of(y - 0.5 / inverse, inverse),
@@ -84,12 +84,12 @@ def octant_slots(
 def nearest(
     x: float, y: float, z: float, i: int, slots: Ints, last_slots: Ints, spheres: Floats, planes: Floats
 ) -> tuple[int, float, int, float]:
-    """Nearest plane and nearest blob among the slots of point i: for each the slot, or -1, and its mean's squared distance, m2.
+    """Nearest plane and nearest non-planar voxel of the slots of point i: slot, or -1, and squared distance of its mean, m2.
 
-    The nearest one stays the same while the point moves by less than half of the difference between the distances to the
-    second nearest and to the nearest one. The blob is kept up to date only without a plane.
-    last_slots : (S, 2) plane and blob found last
-    spheres : (S, 4) where the point was then, m, and the squared distance, m2, within which they stay the same
+    The result is reused while the point moves by less than half of the difference between the distances to the
+    second nearest and to the nearest one. The non-planar voxel is updated only without a plane.
+    last_slots : (S, 2) plane and non-planar voxel of the last search
+    spheres : (S, 4) position of the point then, m, and the squared distance, m2, within which the result is valid
     """
     best, blob = int(last_slots[i, 0]), int(last_slots[i, 1])
     best_d, blob_d = 1e300, 1e300
@@ -322,7 +322,7 @@ def thin_information(p: Floats, xx: float, xy: float, xz: float, yy: float, yz: 
 def solve_on_surfaces(
     H: Floats, S: Floats, g: Floats, facts: Floats, weak_share: float, least: float, d: Floats, weak: Floats
 ) -> int:
-    """As `gauss_newton.solve_observed`, with the observed directions by the share of S; d solves H in them.
+    """Like `gauss_newton.solve_guarded_step`, with the observed directions determined by S; d solves H in them.
 
     `least` applies to H. Both matrices are full, not triangles.
     """

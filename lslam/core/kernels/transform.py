@@ -55,7 +55,7 @@ def rotate_up(points: Any, sine: float, cosine: float) -> None:
     """Rotate every point (N, 3) about p x z, in place, by the angle of `sine` and `cosine`; positive lifts the point.
 
     The axis is horizontal and perpendicular to p, so Rodrigues' formula needs no trigonometry: the horizontal range h
-    becomes h cos - z sin and the height z cos + h sin. Points on the z axis have no such axis and stay; NaN stays NaN.
+    becomes h cos - z sin and the height z cos + h sin. Points on the z axis have no such axis and are unchanged, as is NaN.
     """
     one, s, c = np.float32(1), np.float32(sine), np.float32(cosine)
     for i in range(points.shape[0]):

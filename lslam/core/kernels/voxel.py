@@ -85,7 +85,7 @@ def select_in_gate(
     is_cylinder: bool,
     box: NDArray[np.float64],
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """The points (K, 3) that `gate` keeps, and their times (K,); no times where none are given."""
+    """The points (K, 3) that `gate` keeps, and their times (K,); `times` is (N,) or empty."""
     n = len(points)
     is_timed = len(times) == n
     kept, when = np.empty((n, 3), np.float32), np.empty(n if is_timed else 0, np.float32)
@@ -102,7 +102,7 @@ def select_in_gate(
 
 @kernel
 def count_within(points: NDArray[np.float32], limit: float) -> int:
-    """How many of the points (N, 3) have three finite coordinates that are smaller than `limit`."""
+    """Number of points (N, 3) whose three coordinates are finite and smaller than `limit` in magnitude."""
     count = 0
     for i in range(len(points)):
         # NaN is not smaller.
@@ -227,7 +227,7 @@ def centroids(
 def means(
     points: NDArray[np.float32], times: NDArray[np.float32], size: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int32]]:
-    """As `centroids`, without the scatter: (M, 3) float32, mean time (M,), count (M,), to the same last bit."""
+    """Centroids like `centroids`, without the scatter: (M, 3) float32, mean time (M,), count (M,), with the same bits."""
     n = len(points)
     table = np.empty(table_size(n), np.int32)
     table[:] = -1
@@ -338,7 +338,7 @@ def find_neighboured_cells(
 
 @kernel
 def first_points(points: NDArray[np.float32], size: float) -> NDArray[np.int64]:
-    """Index of the first point in each voxel, increasing."""
+    """Indices, ascending, of the first point in each voxel of `size` m."""
     n = len(points)
     table = np.empty(table_size(n), np.int32)
     table[:] = -1

@@ -98,7 +98,7 @@ def footprint_polygon(footprint: Footprint) -> Any:
 
 
 def footprints_of(geometry: Any) -> tuple[Footprint, ...]:
-    """Footprints of a shapely geometry's polygons, rings turned the right way, slivers under 0.01 m2 left out."""
+    """Footprints of a shapely geometry's polygons, rings oriented as `Footprint` needs, without slivers under 0.01 m2."""
     from shapely.geometry.polygon import orient
 
     polygons: Iterable[Any] = getattr(geometry, "geoms", [geometry])

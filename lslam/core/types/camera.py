@@ -41,9 +41,9 @@ class Lens:
         return np.array([float(self.model == "fisheye"), *self.intrinsics, *coefficients, self._limit(coefficients)])
 
     def _limit(self, k: Floats) -> float:
-        """Largest angle, rad (of a pinhole its tangent), up to which the distortion moves points outwards as they go out.
+        """Largest angle, rad (for a pinhole its tangent), up to which distorted radii increase with the angle.
 
-        Beyond, a polynomial folds the world back into the image.
+        Beyond it, the polynomial would fold the world back into the image.
         """
         r = np.linspace(0, np.pi if self.model == "fisheye" else _WIDEST, 4001)
         r2 = r**2
@@ -95,7 +95,9 @@ class Camera:
     load: Callable[[int], Image]
 
     def image(self, k: int) -> Image:
-        """Image k. Raises InputError when it cannot be read, or has another size than the calibration."""
+        """Read image k, (height, width, 3) uint8. Raises InputError for an unreadable one, or a size other than the
+        calibration's.
+        """
         image = self.load(k)
         height, width = image.shape[:2]
         if (width, height) != self.lens.size:

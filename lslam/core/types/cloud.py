@@ -96,7 +96,7 @@ class ArrayCloud:
 
 
 def in_memory(cloud: Cloud) -> ArrayCloud:
-    """The whole cloud as arrays."""
+    """The whole cloud as arrays; an `ArrayCloud` is returned as it is."""
     if isinstance(cloud, ArrayCloud):
         return cloud
     parts = list(cloud.blocks())
@@ -122,11 +122,11 @@ def bounds(cloud: Cloud) -> tuple[Floats, Floats]:
 
 
 def thin_out(cloud: Cloud, most: int, columns: Sequence[str] = ()) -> ArrayCloud:
-    """At most `most` points of a cloud, the same ones every time: one of each run of so many points of its order.
+    """At most `most` points of a cloud, reproducibly: one random point out of each run of successive ones.
 
-    Which one is as good as random, since every n-th point of a voxel map draws stripes.
+    Every n-th point of a voxel map would form stripes.
 
-    columns : further columns to keep, of those it has
+    columns : further columns to keep, if it has them
     """
     step = max(1, -(-len(cloud) // most))
     kept = step * np.arange(-(-len(cloud) // step))

@@ -83,7 +83,7 @@ class Scan:
         return Span(float(np.fmin.reduce(self.times, initial=0.0)), float(np.fmax.reduce(self.times, initial=0.0)))
 
     def select(self, mask: NDArray[Any]) -> Scan:
-        """The points that `mask` (bool or indices) keeps, together with what is known of each."""
+        """The points selected by `mask` (bool or indices), with all their attributes."""
         return replace(
             self,
             points=self.points[mask],

@@ -198,7 +198,7 @@ class ScanResult:
         return replace(self, T_world_lidar=self.T_world_lidar @ self.stamp_offset, stamp_offset=None)
 
     def in_world(self, T: Floats) -> ScanResult:
-        """The result in the world that `T` (4, 4) leads to: pose, covariances and degenerate directions."""
+        """The result transformed by `T` (4, 4) into another world: pose, covariances and degenerate directions."""
         R = T[:3, :3]
 
         def rotate(covariance: Floats | None) -> Floats | None:

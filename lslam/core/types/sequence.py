@@ -42,7 +42,7 @@ class Calibration:
         return {**own, **{f"T_lidar_{frame}": T for frame, T in self.frames.items()}}
 
     def poses_in_lidar(self) -> dict[str, Floats]:
-        """(4, 4) poses in the LiDAR of all that the recording places, by frame."""
+        """(4, 4) poses in the LiDAR frame of all frames with known extrinsics, by name."""
         T_cam0_lidar = self.T_cam0_lidar
         own = {
             LIDAR_FRAME: np.eye(4),
@@ -53,7 +53,7 @@ class Calibration:
         return {name: T for name, T in {**self.frames, **own}.items() if T is not None}
 
     def T_lidar(self, frame: str) -> Floats:
-        """(4, 4) pose of `frame` in the LiDAR. Raises InputError naming the frames that are known."""
+        """(4, 4) pose of `frame` in the LiDAR frame. Raises InputError naming the known frames."""
         known = self.poses_in_lidar()
         if frame not in known:
             raise InputError(
@@ -80,7 +80,7 @@ def no_shared_time(stream: str) -> str:
 
 
 def readable(indices: Iterable[int], read: Callable[[int], T]) -> Iterator[tuple[int, T]]:
-    """What `read` makes of each index, where it can be read and has points."""
+    """Each index with the result of `read`, except those that are unreadable (InputError) or empty."""
     for index in indices:
         try:
             value = read(index)

@@ -9,10 +9,10 @@ State = dict[str, Any]
 
 
 class Stateful:
-    """An object whose attributes named in `STATE` are all that changes while it works.
+    """An object whose mutable state consists of the attributes named in `STATE`.
 
-    `state` refers to the live object: it is to be written before the object goes on. `restore` is for an object made by the
-    same arguments. Attributes named in `TRANSIENT` are worked out anew after it, and None until then.
+    `state` refers to the live object: write it before the object continues. `restore` needs an object made with the
+    same arguments. Attributes named in `TRANSIENT` are recomputed after it, and None until then.
     """
 
     STATE: ClassVar[tuple[str, ...]] = ()
@@ -23,7 +23,7 @@ class Stateful:
         return {name: _state_of(getattr(self, name)) for name in self.STATE}
 
     def restore(self, state: State) -> None:
-        """Go on where `state` was taken. Raises KeyError when it is of something else."""
+        """Set the attributes from a saved `state`. Raises KeyError for the state of another class."""
         for name in self.STATE:
             part = getattr(self, name)
             if isinstance(part, Stateful):

@@ -137,7 +137,7 @@ class Curve:
 
     @property
     def label(self) -> str:
-        """The series and where it stands in a two-way study."""
+        """Name of the series, with the value of the other parameter in a two-way study."""
         return ", ".join(
             [
                 self.series,
@@ -161,7 +161,7 @@ class Curve:
         return np.asarray(2 * self.losses.sum(1) > self.with_score.sum(1))
 
     def of_seed(self, index: int) -> Curve:
-        """The same curve of one of its seeds alone."""
+        """The same curve for a single seed, by its index."""
         one = slice(index, index + 1)
         return replace(
             self,

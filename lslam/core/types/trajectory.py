@@ -46,7 +46,7 @@ class Trajectory:
         return np.concatenate([np.zeros(min(len(self), 1)), np.cumsum(steps)])
 
     def select(self, index: Any) -> Trajectory:
-        """The poses at `index` (a slice, indices or a mask)."""
+        """The trajectory of the poses at `index` (a slice, indices or a mask)."""
         return replace(
             self,
             stamps_ns=self.stamps_ns[index],

@@ -35,7 +35,7 @@ class Warnings(logging.Filter):
         return True
 
     def beyond(self, messages: Collection[str]) -> list[str]:
-        """The sentences that say more than the `messages` do already, of many alike the first."""
+        """The warnings that `messages` do not contain yet; of many similar ones only the first few."""
         new = [(text, place) for text, place in list(self._places.items()) if not _repeats(text, messages)]
         alike, seen = Counter(place for _, place in new), Counter[str]()
         said = []
@@ -68,7 +68,7 @@ def warnings_so_far() -> Warnings:
 
 @contextmanager
 def collect_warnings() -> Iterator[Warnings]:
-    """Hear the warnings of the block, after those of a block around it: a run may begin before `run` is called."""
+    """Collect the block's warnings, in addition to those of an enclosing block: a run may begin before `run` is called."""
     heard, outer = Warnings(), _collector.get()
     if outer is not None:
         heard.take_over(outer.state())
