@@ -196,7 +196,7 @@ def _align_level(own: Floats, enu: Floats, sigmas: Floats) -> Floats | None:
 
 
 def _in_crs(georeference: Georeference, points: Many[ControlPoint], config: Config) -> Georeference:
-    """The georeference with the CRS of the outputs: the configured one, else that of the points if it is a projection in metres."""
+    """Georeference with the CRS of the outputs: the configured one, else that of the points if it is a projection in metres."""
     crs, height_crs, geoid = config.gnss.crs, config.gnss.height_crs, config.gnss.geoid
     configured = replace(georeference, epsg=crs, height_epsg=height_crs, geoid=geoid)
     codes = {(point.epsg, point.height_epsg) for point in points}

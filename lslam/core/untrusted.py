@@ -218,7 +218,7 @@ class _Window:
         return self._lines + ends, column
 
     def _more(self) -> bool:
-        """Read the next block, at least as long as the unread rest, so that long values are restarted rarely; False at the end."""
+        """Read the next block, at least as long as the unread rest, so that long values restart rarely; False at the end."""
         if self._is_over:
             return False
         self._lines, self._column = self._place()

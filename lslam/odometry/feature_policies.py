@@ -78,7 +78,7 @@ class AllPoints(Stateful):
         )
 
     def enter(self, result: RegistrationResult) -> None:
-        """Insert a registered scan into the map of all points, while that is in use (`CONSTRAINED_SCANS` scans after each use)."""
+        """Insert a registered scan into the map of all points while that is used (`CONSTRAINED_SCANS` scans after each use)."""
         if self._fed >= CONSTRAINED_SCANS:
             return
         self._fed += 1
@@ -111,7 +111,7 @@ class LessPlanar:
     name = "less planar points"
 
     def recover(self, attempt: Attempt, result: RegistrationResult) -> RegistrationResult:
-        """Register less planar points where the result fails, has few inliers, or is degenerate on a map; else return `result`."""
+        """Register less planar points if the result fails, has few inliers, or is degenerate on a map; else return `result`."""
         target, are_few = attempt.target, result.inliers < MIN_FEATURES
         is_degenerate = len(result.degenerate) > 0 and target.map is not None
         if result.ok and not are_few and not is_degenerate:
@@ -146,7 +146,7 @@ class AllPointsInstead:
     """`icp` on all points of the scan, where they contradict the features or constrain a poorly constrained pose."""
 
     def recover(self, attempt: Attempt, result: RegistrationResult) -> RegistrationResult:
-        """Register all points at the start, far from the prior or if poorly constrained; that result, if different, replaces it."""
+        """Register all points at the start, far from the prior or if poorly constrained; that result, if other, replaces it."""
         points, c = attempt.target.all_points, attempt.config
         if points is None:
             return result

@@ -156,7 +156,7 @@ def _from_imu(e: ImuEstimate, step: Increments, R: Floats) -> PreintegratedStep:
 
 
 def _coast(e: ImuEstimate, motion: Floats, seconds: float) -> PreintegratedStep:
-    """A step by the predicted motion (4, 4) of the IMU over `seconds`, for gaps, after standstill and after refusal of the IMU."""
+    """A step by the predicted motion (4, 4) of the IMU over `seconds`, for gaps, after standstill or refusal of the IMU."""
     walk = e.gyroscope.noise
     sigmas = BRAKING_M_S2 * seconds, walk.accel_walk * seconds**0.5, walk.gyro_walk * seconds**0.5
     C = np.diag(np.repeat([0.0, 0.0, *np.square(sigmas)], 3))

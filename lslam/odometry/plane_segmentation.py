@@ -263,7 +263,7 @@ class _Cells:
         return cls(count, mean, scatter, voxels.planes[slots, 3:6], voxels.planes[slots, 7], tree, touching)
 
     def grow(self, seed: int, mean: Floats, n: Floats, radii: tuple[float, ...], free: Bools) -> Longs:
-        """Sorted indices of the `free` voxels connected to `seed` that lie on the plane through `mean` (3,) with normal n (3,)."""
+        """Sorted indices of `free` voxels connected to `seed` that lie on the plane through `mean` (3,) with normal n (3,)."""
         d, alone = float(n @ mean), np.array([seed])
         region = alone
         for radius in radii:

@@ -143,7 +143,7 @@ class PlaneWindow:
         return replace(self, values=values, prior=prior, sightings=self.sightings.join(more), landmarks=landmarks)
 
     def solve(self) -> tuple[PlaneWindow | None, int]:
-        """The window at the minimum of all factors, and the number of Gauss-Newton steps; None where H is not positive definite."""
+        """Window at the minimum of all factors, and number of Gauss-Newton steps; None where H is not positive definite."""
         window, count = self, 0
         pose = np.arange(6) + self.values.first_plane - STATE_SIZE
         while count < MOST_STEPS:

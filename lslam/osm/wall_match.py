@@ -284,7 +284,7 @@ def warm_up() -> None:
 
 
 def match_keyframe(view: KeyframeMatch, osm: OsmMap, config: OsmConfig) -> KeyframeMatch:
-    """Match the walls of `view` with the buildings in range of its prior pose and sigma; `reason` says why a match is rejected."""
+    """Match the walls of `view` with the buildings in range of its prior pose and sigma; `reason` tells why it is rejected."""
     if not len(view.walls):
         return replace(view, reason="no walls seen")
     reach = config.use_radius + SEARCH_SIGMAS * float(np.hypot(view.sigma[0], view.sigma[1]))

@@ -243,7 +243,7 @@ def write_results(job: PreparedRun, record: RunRecord, back_end: BackEnd, evalua
 
 
 def raise_outcome(manifest: Manifest, config: Config, way_out: str) -> None:
-    """Raise the error of a run that diverged, was interrupted, or is degraded under `input.strict`; `way_out` ends the sentence."""
+    """Raise the error of a run that diverged, was stopped, or is degraded under `input.strict`; `way_out` ends the sentence."""
     why = "; ".join(manifest.problems)
     if manifest.outcome == "interrupted":
         raise InterruptedRunError(f"{why}; what was done is written{way_out}")

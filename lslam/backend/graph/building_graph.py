@@ -138,7 +138,7 @@ def _as_arrays(
 def _linear(
     count: int, owners: NDArray[np.intp], measurements: Floats, weights: Floats, map_prior: MapPrior
 ) -> tuple[Floats, Floats, Floats]:
-    """Displacements (B, 3), covariances (B, 3, 3) and common shift (2,) by least squares, the buildings being eliminated first."""
+    """Displacements (B, 3), covariances (B, 3, 3) and common shift (2,) by least squares; buildings are eliminated first."""
     own = np.diag(1.0 / map_prior.sigma**2)
     normal, pull = np.tile(own, (count, 1, 1)), np.zeros((count, 3))
     np.add.at(normal, owners, weights)

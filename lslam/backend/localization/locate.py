@@ -118,7 +118,7 @@ class PlaceFinder:
         self.reasons: list[str] = []
 
     def find(self, prior: StartPrior | None = None, should_stop: Callable[[], bool] = lambda: False) -> Start | None:
-        """The start; None, with `reasons`, when no keyframe is located or they do not agree, or when `should_stop` returns True."""
+        """Start; None, with `reasons`, when no keyframe is located or they do not agree, or when `should_stop` returns True."""
         votes: list[Vote] = []
         tried = 0
         throttle = LoopThrottle(SPACING_M)

@@ -259,7 +259,7 @@ class PlaceSearch:
         return best
 
     def _pose(self, query: LevelSubmap, shift: Floats, yaw: float) -> Floats:
-        """Pose (4, 4) of the query by `shift` (2,), m, and `yaw`, rad; its height is the median difference of the common ground."""
+        """Pose (4, 4) of the query by `shift` (2,), m, and `yaw`, rad; height: the median difference of the common ground."""
         R = so3.exp(np.array([0.0, 0.0, yaw]))
         turned = query.ground @ R.T + np.array([*shift, 0.0])
         cells, inside = self.grid.cells_of(turned)

@@ -132,7 +132,7 @@ def _flat(tree: Any) -> dict[str, Any]:
 
 
 def _sensor(entries: dict[str, Any], layout: str) -> OusterSensor:
-    """Sensor by the flattened metadata `entries` and the packet profile `layout`; raises ValueError or KeyError if they misfit."""
+    """Sensor by the flattened metadata `entries` and the packet profile `layout`; ValueError or KeyError if they misfit."""
     width, rate = (int(word) for word in str(entries["lidar_mode"]).split("x"))
     width, columns = int(entries.get("columns_per_frame") or width), int(entries.get("columns_per_packet") or 16)
     altitudes, azimuths = (

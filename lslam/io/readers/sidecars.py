@@ -114,7 +114,7 @@ def per_point_folder(folder: Path, info: SequenceInfo) -> Path | None:
 def _load(
     folder: Path, stated_name: str | None, usual: str, read: Callable[[Path, list[str]], T], voice: Voice
 ) -> T | None:
-    """The file `stated_name` of `sequence.toml`, or `usual`, read by `read`; None, perhaps with a problem, without a valid one."""
+    """The file `stated_name` of `sequence.toml`, or `usual`, read by `read`; None, perhaps with a problem, if none is valid."""
     path = folder / (stated_name or usual)
     if not path.is_file():
         if stated_name is not None:

@@ -265,7 +265,7 @@ class Tracker(Stateful):
 def _fuse_with(
     motion: MotionModel, odometry: Deskewing, stamp_ns: int, result: RegistrationResult, prior: MotionPrior
 ) -> RegistrationResult:
-    """The registration fused by the motion model. A window is fused with the scan's normal equations, and once more if it moved."""
+    """Registration fused by the motion model. A window is fused with the scan's normal equations, and once more if it moved."""
     if not (isinstance(motion, WindowMotion) and isinstance(odometry, WindowMethod)):
         return motion.fuse(stamp_ns, result, prior)
     motion.take(odometry.equations(stamp_ns, result))

@@ -258,7 +258,7 @@ class FilterMotion(InertialMotion):
         return replace(swept, covariance=prior.covariance)
 
     def fuse(self, stamp_ns: int, result: RegistrationResult, prior: MotionPrior) -> RegistrationResult:
-        """Return the result unchanged: its registration used points and prior already. All other states are updated by its pose."""
+        """Return the result unchanged: it was registered with points and prior. All other states are updated by its pose."""
         C = result.covariance
         if C is None or not result.is_accepted or prior.covariance is None or self._next is None:
             return result

@@ -165,7 +165,7 @@ class WheelMotion(ConstantVelocity):
     def correct(
         self, stamp_ns: int, pose: Floats, prior: MotionPrior | None = None, has_registration: bool = True
     ) -> None:
-        """Update by the pose (4, 4) at `stamp_ns`, and adopt the calibration of `fuse`; `prior` is the motion within the sweep."""
+        """Update by the pose (4, 4) at `stamp_ns`; adopt the calibration of `fuse`; `prior` is the motion within the sweep."""
         _, instant_ns = (pose, stamp_ns) if prior is None else middle_of(prior, stamp_ns, pose)
         reckoning, learnt_now = self._reckoned, self._learnt
         if reckoning is not None:
@@ -203,7 +203,7 @@ class WheelMotion(ConstantVelocity):
             log.warning("the wheels are refused from here on: %s", self.refusal)
 
     def _reckon(self, instant_ns: int) -> ReckonedStep | None:
-        """Predicted step from the newest pose to `instant_ns`, of wheels and constant velocity; None in a gap or after refusal."""
+        """Predicted step from the newest pose to `instant_ns`, of wheels and constant velocity; None in gaps or after refusal."""
         begin_ns = self._instant_ns
         if self.refusal or begin_ns is None or instant_ns <= begin_ns or not covers(self._gaps, begin_ns, instant_ns):
             return None
@@ -233,7 +233,7 @@ class WheelMotion(ConstantVelocity):
         return ReckonedStep(pose, self.calibration.state_covariance(wheels) + noise + lost, wheels, steady, is_slip)
 
     def _learn_from(self, reckoning: ReckonedStep, instant_ns: int, middle: Floats, C: Floats) -> LearntFromScan:
-        """Calibration and noise updated by the registered pose `middle` (4, 4) with covariance C (6, 6), and prediction errors."""
+        """Calibration and noise updated by the registered pose `middle` (4, 4) with covariance C (6, 6); prediction errors."""
         up, B = self.calibration.up, np.zeros((4, 6))
         B[:3, :3], B[3, 3:] = self._pose[:3, :3].T, self._pose[:3, :3] @ up
         # Both ends of the step were registered.

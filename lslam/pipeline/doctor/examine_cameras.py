@@ -163,7 +163,7 @@ def beam_spacing(scan: Scan) -> Floats:
 
 
 def depth_edges(scan: Scan) -> tuple[NDArray[np.intp], Floats]:
-    """Indices (N,) of points behind which the range jumps to the next beam of their ring, and the jump / range (N,), at most 1."""
+    """Indices (N,) of points behind which the range jumps to the next beam of their ring, and jump / range (N,), at most 1."""
     assert scan.rings is not None
     r = np.linalg.norm(scan.points, axis=1).astype(np.float64)
     azimuth = portable.arctan2(scan.points[:, 1].astype(np.float64), scan.points[:, 0].astype(np.float64))

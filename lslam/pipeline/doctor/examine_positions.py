@@ -224,7 +224,7 @@ def _factors() -> list[float]:
 
 
 def _suspect(what: str, factor: float, would_be: str) -> tuple[str, str]:
-    """Finding and remedy for stamps in a wrong unit: `what` is `factor` times too slow (> 1) or too fast; `would_be` if mended."""
+    """Finding and remedy of stamps in a wrong unit: `what` is `factor` times too slow (> 1) or too fast; `would_be` if mended."""
     if factor > 1:
         is_so, way = f"slow, as {UNITS[factor][0]} taken for s are", f"divide them by {factor:,.0f}"
     else:

@@ -303,7 +303,7 @@ def rings_rule(sequence: Sequence) -> tuple[str | None, str]:
 
 
 def _scan_facts(scan: Scan) -> Facts:
-    """Facts of one scan: counts of points and of faulty ones, quantiles of range (m) and elevation (deg), ranges of its fields."""
+    """Facts of one scan: counts of points and faulty ones, quantiles of range (m) and elevation (deg), ranges of its fields."""
     points = scan.points
     finite = np.isfinite(points).all(axis=1)
     zero = (points == 0).all(axis=1)
