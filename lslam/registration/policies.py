@@ -42,8 +42,8 @@ START_STEP_M = 1.0
 # A hand-held sensor turns at 100 deg/s, by 30 deg at every third scan; so far apart that 20 m away a step is left.
 TURN_STEP_DEG = 3.0
 START_TURNS_DEG = np.delete(np.arange(-30.0, 31.0, TURN_STEP_DEG), 10)
-# Every so many-th source point is enough to tell a good start from a bad one; so many of the best are looked at closely.
-SEARCH_STRIDE, MOST_STARTS = 4, 3
+# Every so many-th source point is enough to tell a good start from a bad one.
+SEARCH_STRIDE = 4
 # Along a bare wall the rings repeat best where nothing moved, by five percent: a start elsewhere must have more, and twice
 # as much where planes, the prior or both say otherwise.
 CLEAR_RATIO = 1.05
@@ -181,18 +181,14 @@ def _best_start(
         for offset in start_offsets(attempt.config.start_reach, START_STEP_M, up_of(target.preprocess))
     ]
     # Without non-ground points, as in hills, the ground decides.
-    trials.sort(key=lambda at: (-non_ground.share(high, at.T_world_lidar), -at.inliers))
-    for promising in distinct(trials, best.T_world_lidar):
-        start = promising.T_world_lidar
-        # Once more as wide as from an unknown start, what was found right could be drawn to the false place again.
-        result = attempt.judge(target.coarse_to_fine(attempt.points, start, 2 * START_STEP_M), start)
-        share, usual = (non_ground.share(high, at.T_world_lidar) for at in (result, best))
-        if count == 0:
-            share, usual = result.agreement, best.agreement
-        # A failed one has the prior's pose: fewer inliers than there are no improvement.
-        if result.ok and (share > CLEAR_RATIO * usual if best.ok else share >= usual):
-            best = result
-    return best
+    start = min(trials, key=lambda at: (-non_ground.share(high, at.T_world_lidar), -at.inliers)).T_world_lidar
+    # Once more as wide as from an unknown start, what was found right could be drawn to the false place again.
+    result = attempt.judge(target.coarse_to_fine(attempt.points, start, 2 * START_STEP_M), start)
+    share, usual = (non_ground.share(high, at.T_world_lidar) for at in (result, best))
+    if count == 0:
+        share, usual = result.agreement, best.agreement
+    # A failed one has the prior's pose: fewer inliers than there are no improvement.
+    return result if result.ok and (share > CLEAR_RATIO * usual if best.ok else share >= usual) else best
 
 
 def _likeliest(non_ground: NonGroundPoints, high: PreparedPoints, T_prior: Floats, reach: float, up: Floats) -> Floats:
@@ -216,17 +212,6 @@ def is_much_more(ours: Bools, others: Bools, margin: float = MUCH_RATIO) -> bool
     """
     won, lost = np.count_nonzero(ours & ~others), np.count_nonzero(others & ~ours)
     return bool(np.count_nonzero(ours) > margin * np.count_nonzero(others) and is_more(int(won), int(lost)))
-
-
-def distinct(results: list[RegistrationResult], T_best: Floats) -> list[RegistrationResult]:
-    """The first `MOST_STARTS` places that lie at least half a step from the known pose (4, 4) and from each other."""
-    places, apart = [T_best[:3, 3]], []
-    for result in results:
-        place = result.T_world_lidar[:3, 3]
-        if min(float(np.linalg.norm(place - other)) for other in places) > START_STEP_M / 2:
-            places.append(place)
-            apart.append(result)
-    return apart[:MOST_STARTS]
 
 
 def start_offsets(reach: float, step: float, up: Floats = Z) -> Floats:
