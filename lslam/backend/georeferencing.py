@@ -294,10 +294,7 @@ def describe_outliers(alignment: GnssAlignment, fixes: Fixes) -> str:
 def _fix_noise(
     fixes: Fixes, alignment: GnssAlignment, keyframes: Many[Keyframe], graph: PoseGraph, config: Config
 ) -> tuple[GaussMarkovNoise | None, float]:
-    """Correlated noise of the fixes and the factor on odometry's drift, from the inliers.
-
-    Neither where the recording states no sigmas.
-    """
+    """Correlated noise of the fixes and factor on odometry's drift, from the inliers; neither without stated sigmas."""
     good = alignment.inliers
     if not (fixes.has_stated_sigmas or fixes.is_overconfident):
         return None, 0.0
@@ -342,10 +339,7 @@ def _as_factors(
     keyframes: Many[Keyframe],
     fix_noise: GaussMarkovNoise | None,
 ) -> tuple[PositionFix, ...]:
-    """Position factors, each on the keyframe before its fix; gross outliers are omitted.
-
-    shift : (4, 4) from the frame of the fixes to that of the georeference
-    """
+    """Position factors on keyframes, without gross outliers; shift : (4, 4) from the fixes' frame to the georeference's."""
     near = np.linalg.norm(alignment.residuals / np.hypot(fixes.sigmas, fixes.slack[:, None]), axis=1) < ABSURD
     owners = _owners(fixes, keyframes)
     positions = se3.apply(shift, fixes.positions)

@@ -208,10 +208,7 @@ def _report(placement: Placement, inputs: BackEndInput) -> Placement:
 def _by_fixes(
     sequence: Sequence, graph: PoseGraph, inputs: BackEndInput, results: list[ScanResult] | None = None
 ) -> Placement:
-    """Placement of the graph's poses by the fixes of a run.
-
-    results : all scans at those poses; None for odometry's scans moved with the keyframes
-    """
+    """Placement of the graph's poses by fixes; results : scans at those poses, None: odometry's, moved with the keyframes."""
     keyframes, config = inputs.store.keyframes, inputs.config
     up = _up(graph)
     if results is None and graph.estimated_drift is None:

@@ -65,6 +65,7 @@ def command(jobs_file: Path, **given: Any) -> None:
 
 
 def _expand(path: Path, output: OutputOptions, given: dict[str, Any]) -> ExpandedStudy:
+    """Jobs of a batch file, or of the lines `lslam run ...` on stdin if `path` is `-`. Raises UsageError without a line."""
     if path != Path("-"):
         from lslam.core.config.config import check_settings
         from lslam.core.config.study import read_batch
@@ -119,6 +120,7 @@ def _line(number: int, words: list[str], given: dict[str, Any]) -> RunLine:
 
 
 def _print_plan(study: ExpandedStudy, as_json: bool) -> None:
+    """Print the jobs with their folders and refusals."""
     if as_json:
         runs = [
             {
@@ -135,6 +137,7 @@ def _print_plan(study: ExpandedStudy, as_json: bool) -> None:
 
 
 def _print(rows: list[StudyRow], out: Path, as_json: bool) -> None:
+    """Print the results as a table or JSON."""
     from lslam.reports.study_table import batch_table, rows_document
     from lslam.reports.text import text_table
 

@@ -123,6 +123,7 @@ def _is_ready(word: str) -> bool:
 
 
 def _print_list(as_json: bool) -> None:
+    """Print the ready comparisons with their summaries."""
     from lslam.studies.ready_comparison import comparison_names, find_comparison
 
     summaries = {name: find_comparison(name).summary for name in comparison_names()}
@@ -133,10 +134,7 @@ def _print_list(as_json: bool) -> None:
 
 
 def _ready_plan(name: str, given: dict[str, Any]) -> Plan:
-    """A comparison that ships with lslam, in a folder of its name, in which it goes on.
-
-    Raises UsageError for an option that it has no use for.
-    """
+    """Comparison that ships with lslam, in a folder of its name. Raises UsageError for an option that it does not use."""
     from lslam.studies.compare import Plan
     from lslam.studies.options import COMPARISON, OutputOptions, check_numbers, require_free
     from lslam.studies.ready_comparison import find_comparison
@@ -172,6 +170,7 @@ def _crop(text: str | None) -> tuple[float, float, float] | None:
 
 
 def _truth(path: Path | None, subjects: Sequence[Subject]) -> Trajectory | None:
+    """Ground truth from `path` for the only recording; None without a path. Raises UsageError for several, or a scenario."""
     from lslam.cli.one_run import read_truth
     from lslam.core.errors import UsageError
     from lslam.io.readers import open_sequence
@@ -185,6 +184,7 @@ def _truth(path: Path | None, subjects: Sequence[Subject]) -> Trajectory | None:
 
 
 def _print(comparison: Comparison, style: str, as_json: bool) -> None:
+    """Print the comparison in `style` or as JSON, on a terminal in colours."""
     from lslam.reports import compare_table
 
     if as_json:

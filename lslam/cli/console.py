@@ -231,6 +231,7 @@ def progress(
 
 
 def _plain(title: str, total: int, unit: str, remaining: RemainingTime) -> Advance:
+    """Function that logs progress at most every ten seconds, and at the end."""
     began = last = time.monotonic()
     done = 0
 

@@ -120,6 +120,7 @@ def _is_trajectory(path: Path) -> bool:
 
 
 def _open(source: str, given: dict[str, Any]) -> Sequence:
+    """Selected scans of a recording; without a trajectory that deskews them, point times are added only as stated."""
     from lslam.io.readers import open_sequence
 
     sequence = open_sequence(source, data_root=given["data_root"], **options.reading_of(given))
@@ -132,6 +133,7 @@ def _open(source: str, given: dict[str, Any]) -> Sequence:
 
 
 def _convert_sequence(source: str, kind: str, out: Path, given: dict[str, Any]) -> None:
+    """Convert a recording, deskewed by a trajectory if one is given. Raises click.UsageError for one without rotations."""
     from lslam.cli.console import log, progress
     from lslam.pipeline.convert import check_output
 
@@ -165,6 +167,7 @@ def _convert_sequence(source: str, kind: str, out: Path, given: dict[str, Any]) 
 
 
 def _convert_run(folder: Path, kind: str, out: Path | None, given: dict[str, Any]) -> None:
+    """Convert a run to a bag, with its deskewed scans unless refused; `out` None is within the run."""
     from lslam.cli.console import progress
     from lslam.pipeline.convert import check_output
 
@@ -205,6 +208,7 @@ def _print(text: str, path: Path, kind: str, values: dict[str, Any], given: dict
 
 
 def _convert_to_gpkg(folder: Path, out: Path, given: dict[str, Any]) -> None:
+    """Convert a run to the layers of a GeoPackage."""
     from lslam.pipeline.convert.to_gpkg import convert_to_gpkg
 
     options.require_there(folder)
@@ -214,6 +218,7 @@ def _convert_to_gpkg(folder: Path, out: Path, given: dict[str, Any]) -> None:
 
 
 def _convert_trajectory(source: str, kind: str, out: Path, given: dict[str, Any]) -> None:
+    """Convert a trajectory file; formats with coordinates on the Earth need a georeference beside it."""
     from lslam.maps.georeference import Projection
     from lslam.pipeline.convert.convert_trajectory import convert_trajectory, georeference_beside
 

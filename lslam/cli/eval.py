@@ -131,6 +131,7 @@ def _config(given: dict[str, Any], flags: dict[str, Any]) -> EvalConfig:
 def _evaluate_all(
     estimates: tuple[Path, ...], truth: Path, config: EvalConfig, given: dict[str, Any]
 ) -> list[Evaluation]:
+    """Evaluate each trajectory against the truth; a run folder has its own calibration where the truth lacks one."""
     from lslam.core.errors import InputError
     from lslam.evaluation.evaluate import evaluate
     from lslam.io.formats.kitti_layout import read_transform

@@ -121,6 +121,7 @@ def command(sequence: str | None, as_json: bool, imu_toml: Path | None, **given:
 
 
 def _show_machine(sequence: str | None, machine: bool, as_json: bool) -> None:
+    """Print facts of the machine; raises click.UsageError unless just `machine` is chosen."""
     if sequence is not None or not machine:
         raise click.UsageError("SEQUENCE or --machine says what is looked at: give one of them")
     from lslam.cli.machine import machine_document, machine_rows
@@ -159,6 +160,7 @@ def _show_bag(name: str, data_root: Path | None, error: str | None) -> None:
 
 
 def _lines(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    """Rows (title, text) of the facts of a recording."""
     time, points = facts["time"], facts["points"]
     yield "sequence", f"{facts['name']}  ({facts['path']})"
     yield "format", facts["format"] + (f", sensor {facts['sensor']}" if facts["sensor"] else "")
@@ -214,6 +216,7 @@ def _limits(limits: list[float] | None, unit: str) -> str:
 
 
 def _imu(imu: dict[str, Any] | None) -> str:
+    """Text on the IMU: samples, rate, mean specific force and its unit, tilt, rotation rate."""
     if imu is None:
         return "none"
     rate = f"{imu['rate_hz']:.1f} Hz, " if imu["rate_hz"] else ""
@@ -226,6 +229,7 @@ def _imu(imu: dict[str, Any] | None) -> str:
 
 
 def _noise(noise: dict[str, Any] | None) -> str:
+    """Text on the noise and bias instability of the IMU, and how they were estimated."""
     if noise is None:
         return "unknown"
     how = f"Allan deviation over {noise['standing_s']:.0f} s of standing"
@@ -239,6 +243,7 @@ def _noise(noise: dict[str, Any] | None) -> str:
 
 
 def _write_noise(path: Path, facts: dict[str, Any]) -> None:
+    """Write the estimated IMU noise as TOML. Raises InputError without an estimate."""
     from lslam.core.errors import InputError
     from lslam.io.formats.atomic import atomic_write
     from lslam.pipeline.doctor.examine_imu import imu_toml
@@ -252,6 +257,7 @@ def _write_noise(path: Path, facts: dict[str, Any]) -> None:
 
 
 def _turns(turns: dict[str, Any] | None) -> str:
+    """Text on the agreement of rotation between IMU and scans: correlation, time offset and sigma, ms."""
     if turns is None:
         return "not compared"
     if turns["correlation"] is None:
@@ -265,6 +271,7 @@ def _turns(turns: dict[str, Any] | None) -> str:
 
 
 def _gnss(gnss: dict[str, Any] | None) -> str:
+    """Text on the satellite fixes: number, rate, first position, sigma, m."""
     if gnss is None:
         return "none"
     lat, lon, alt = gnss["first"]
@@ -278,6 +285,7 @@ def _gnss(gnss: dict[str, Any] | None) -> str:
 
 
 def _ground_truth(truth: dict[str, Any] | None) -> str:
+    """Text on the ground truth: poses, frame, path length and extent, m."""
     if truth is None:
         return "none"
     x, y, z = truth["extent_m"]

@@ -64,6 +64,7 @@ def _cores() -> dict[str, Any]:
 
 
 def _memory() -> dict[str, Any]:
+    """Memory in bytes: of the machine, free, and the container's limit."""
     page = os.sysconf("SC_PAGE_SIZE")
     free = os.sysconf("SC_AVPHYS_PAGES") * page
     for line in Path("/proc/meminfo").read_text().splitlines() if Path("/proc/meminfo").exists() else ():
@@ -86,6 +87,7 @@ def _container(limit: str) -> float | None:
 
 
 def _kernels() -> dict[str, Any]:
+    """Folder of compiled kernels, its size in bytes and number of kernels."""
     from lslam.core.kernels.cache import kernel_folder
 
     folder = kernel_folder()
@@ -96,6 +98,7 @@ def _kernels() -> dict[str, Any]:
 
 
 def _browser() -> dict[str, Any]:
+    """Name of the browser, and whether it can open pages here."""
     import webbrowser
 
     from lslam.cli.console import has_window
@@ -127,6 +130,7 @@ def library_versions() -> dict[str, str | None]:
 
 
 def _extras() -> dict[str, Any]:
+    """Optional packages by extra: whether installed, their use, and the command to install them."""
     return {
         name: {
             "installed": all(find_spec(module) is not None for module in modules),
@@ -155,6 +159,7 @@ def _limit(value: float | None, text: Callable[[float], str]) -> str:
 
 
 def _of_proj(part: dict[str, Any]) -> list[str]:
+    """Texts on PROJ: version and folders, grids of heights, other grids."""
     vertical, others = part["vertical"], part["others"]
     return [
         f"{part['version']}, network {'on' if part['network'] else 'off'}, grids in {', '.join(part['folders'])}",

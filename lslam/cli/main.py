@@ -86,6 +86,7 @@ class LazyGroup(click.Group):
 
 
 def _print_version(ctx: click.Context, _: click.Parameter, wants_version: bool) -> None:
+    """Print the versions of lslam and its libraries, and exit, if asked for by the option."""
     if not wants_version or ctx.resilient_parsing:
         return
     from lslam.cli.machine import library_versions
@@ -157,6 +158,7 @@ def _exit_codes() -> Iterator[None]:
 
 
 def _fail(message: str, code: int) -> NoReturn:
+    """Print the error, or send it as an event, and exit with `code`."""
     is_too_late()
     message = sentence(message)
     from lslam.cli.console import events
@@ -170,6 +172,7 @@ def _fail(message: str, code: int) -> NoReturn:
 
 
 def _fail_usage(error: click.ClickException) -> NoReturn:
+    """Print an error of the command line and exit with code 2; without arguments, print the help."""
     if type(error).__name__ == "NoArgsIsHelpError":
         error.show(file=sys.stderr)
         click.echo("\nNew here? `lslam demo` simulates a drive, runs it and opens its page, in a minute.", err=True)

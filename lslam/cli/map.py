@@ -66,6 +66,7 @@ def of_the_map(settings: Iterable[str]) -> list[str]:
 
 
 def _print_changes(folder: Path, result: ChangedCells, as_json: bool) -> None:
+    """Print numbers and files of the changes, or all of them as JSON."""
     from lslam.pipeline.change_pass import AREAS, CLOUD, properties
 
     things = [properties(number, change) for number, change in enumerate(result.changes, 1)]
@@ -160,6 +161,7 @@ def command(target: Path, **given: Any) -> None:
 
 
 def _measure(target: Path, given: dict[str, Any]) -> None:
+    """Print scores of a map, and its difference to another map."""
     options.require_there(target, given["against"])
     from lslam.maps.crispness import RADIUS, THRESHOLD, compare, crispness
     from lslam.pipeline.stored_map import map_of
@@ -188,6 +190,7 @@ def _measure(target: Path, given: dict[str, Any]) -> None:
 
 
 def _rebuild(target: Path, given: dict[str, Any]) -> None:
+    """Rebuild the map of a run with the options `given`, into one file or tiles. Raises UsageError for contradicting options."""
     from lslam.pipeline.run_folder import require_run
 
     for flag, other in (("threshold", "--against"), ("radius", "--score")):
@@ -219,6 +222,7 @@ def _rebuild(target: Path, given: dict[str, Any]) -> None:
 
 
 def _rebuild_tiles(run: EarlierRun, folder: Path, crs: OutputCrs | None, given: dict[str, Any]) -> None:
+    """Rebuild the map of a run in tiles. Raises UsageError with options of one file."""
     from lslam.pipeline.map_tiles import check_tiles, rebuild_in_tiles
     from lslam.pipeline.rebuild import open_scans
 

@@ -66,6 +66,7 @@ def command(runs: tuple[Path, ...], **given: Any) -> None:
 
 
 def _summary(out: Path, manifest: dict[str, Any]) -> str:
+    """Summary of a merge: sessions, loops between them, errors before and after where there is ground truth."""
     from lslam.core.printable import count_of, metres
 
     lines = [f"merged, {count_of(len(manifest['sessions']), 'session')}", f"  {'status':<12} {manifest['status']}"]

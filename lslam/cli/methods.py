@@ -37,6 +37,7 @@ def command(as_json: bool) -> None:
 
 
 def _group(method: ListedMethod) -> str:
+    """Title of the group in which a method is listed."""
     from lslam.odometry import METHODS, Coupling
 
     if method.name not in METHODS:

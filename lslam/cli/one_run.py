@@ -154,6 +154,7 @@ class StackProfile:
         self._ended = time.perf_counter()
 
     def _look(self) -> None:
+        """Sample the stacks of all other threads until the end; the interval doubles after `MAX_STACKS` changes."""
         own = threading.get_ident()
         before = self._began
         while not self._is_over.wait(self._interval_s):
@@ -167,6 +168,7 @@ class StackProfile:
                 self._interval_s, self._changes = 2 * self._interval_s, 0
 
     def _add(self, ident: int, stack: tuple[Frame, ...], before: float, now: float) -> None:
+        """Extend the thread's last interval if its stack is unchanged, else add one; `before`, `now` : s."""
         number = self._stacks.setdefault(stack, len(self._stacks))
         changes = self._by_thread.setdefault(ident, [])
         if changes and changes[-1][0] == number and changes[-1][2] == before:

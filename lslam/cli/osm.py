@@ -92,6 +92,7 @@ def _box(text: str) -> list[float]:
 
 
 def _bounds(given: dict[str, Any], radius: float) -> Bounds:
+    """Bounds, deg, of the box, of a circle round a position, or of the recordings of `--along` with a margin of `radius` m."""
     import numpy as np
 
     from lslam.osm import bounds
@@ -105,6 +106,7 @@ def _bounds(given: dict[str, Any], radius: float) -> Bounds:
 
 
 def _write(out: Path, reply: OverpassReply, as_json: bool) -> None:
+    """Write a reply of Overpass as JSON or OSM XML by the suffix of `out`, and print the number of buildings."""
     from lslam.io.formats.atomic import atomic_write
     from lslam.io.formats.osm_buildings import buildings_of, middle_of
     from lslam.io.formats.osm_files import write_osm
@@ -157,6 +159,7 @@ def show(file: Path, png: Path | None, origin: str | None, overwrite: bool, as_j
 
 
 def _facts(extract: BuildingExtract) -> dict[str, Any]:
+    """JSON document of an extract: numbers, lengths, m, areas, m2, and corners, deg."""
     import numpy as np
 
     from lslam.core.geometry.geodesy import from_local
@@ -184,6 +187,7 @@ def _facts(extract: BuildingExtract) -> dict[str, Any]:
 
 
 def _print(facts: dict[str, Any], png: Path | None) -> None:
+    """Print the facts of an extract."""
     elements = facts["elements"]
     (south, west), (north, east), (width, depth) = facts["south_west"], facts["north_east"], facts["size_m"]
     left_out = ", ".join(f"{count} x {why}" for why, count in facts["left_out"].items())

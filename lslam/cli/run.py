@@ -224,6 +224,7 @@ def _flags(given: dict[str, Any]) -> dict[str, Any]:
 
 
 def _print_plan(sequence: Sequence, config: Config, out: Path, as_json: bool) -> None:
+    """Print what the run would read, its folder and configuration."""
     from lslam.core.config import to_toml
 
     if as_json:

@@ -155,6 +155,7 @@ def _draw_map(
 
 
 def _write_plan(path: Path, scene: RayScene, city: City, line: Floats) -> SimulationFile:
+    """Draw the plan of the world with the path to `path`."""
     from lslam.reports.plans import write_plan
     from lslam.simulation.plan import plan_of
 
@@ -201,6 +202,7 @@ def record_drive(
 
 
 def _print_scenario(name: str, settings: tuple[str, ...], as_json: bool) -> None:
+    """Print the scenario as TOML."""
     from lslam.simulation.scenario_files import find_scenario, scenario_text
 
     text = scenario_text(find_scenario(name, settings))
@@ -211,6 +213,7 @@ def _print_scenario(name: str, settings: tuple[str, ...], as_json: bool) -> None
 
 
 def _print_list(as_json: bool) -> None:
+    """Print scenarios, LiDARs and IMUs."""
     from lslam.simulation.imu import IMUS
     from lslam.simulation.lidar_models import LIDARS
     from lslam.simulation.scenario_files import find_scenario, scenario_names

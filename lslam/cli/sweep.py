@@ -122,6 +122,7 @@ def _report(folder: Path) -> list[str]:
 
 
 def _print_verdicts(verdicts: list[str], folder: Path, rows: list[StudyRow] | None, as_json: bool) -> None:
+    """Print the verdicts, as JSON with the folder and the rows if there are some."""
     if not as_json:
         show("".join(f"{verdict}\n" for verdict in verdicts))
         return
@@ -135,6 +136,7 @@ def _print_verdicts(verdicts: list[str], folder: Path, rows: list[StudyRow] | No
 
 
 def _print_list(as_json: bool) -> None:
+    """Print the studies with their summaries."""
     from lslam.studies.options import find_study, study_names
 
     summaries = {name: find_study(name).summary for name in study_names()}

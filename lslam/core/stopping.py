@@ -123,10 +123,7 @@ _asked: ContextVar[tuple[Callable[[], bool], str]] = ContextVar("asked", default
 
 @contextmanager
 def asking(should_stop: Callable[[], bool], message: str) -> Iterator[None]:
-    """In the block, in this thread, `check_stop` asks `should_stop`: so loops far below need not be handed it.
-
-    message : the sentence when it says so
-    """
+    """In the block, in this thread, `check_stop` calls `should_stop`; message : of the error when that returns True."""
     token = _asked.set((should_stop, message))
     try:
         yield

@@ -116,6 +116,7 @@ class AbsoluteTrajectoryError(TrajectoryMetric[dict[str, AbsoluteError]]):
         return [f"ATE {error.recipe if error.available else f'{name}: {error.note}'}" for name, error in errors]
 
     def tables(self, e: Evaluation) -> list[Table]:
+        """Table of the errors, one row per alignment."""
         rows = []
         for name, error in self.of(e).items():
             if not error.available or error.translation is None:
@@ -154,6 +155,7 @@ class AbsoluteTrajectoryError(TrajectoryMetric[dict[str, AbsoluteError]]):
         return "ATE", None, "m"
 
     def comparison_metrics(self, configs: Sequence[EvalConfig]) -> list[Metric]:
+        """Rmse of each alignment of `configs` as main metric, its largest error and rotation as further ones."""
         names = list(dict.fromkeys(name for config in configs for name in config.align))
         main = [
             Metric(f"ate.{name}", f"ATE {name}", "m", "error", f"alignment {name}: {ALIGNMENTS[name]}; rmse over poses")
@@ -163,6 +165,7 @@ class AbsoluteTrajectoryError(TrajectoryMetric[dict[str, AbsoluteError]]):
         return main + [Metric(key, key, unit, "error", is_main=False) for key, unit in more]
 
     def values(self, document: Document) -> dict[str, float]:
+        """Rmse, m, largest error, m, and rotation rmse, deg, by metric key, of the alignments that are available."""
         values = {}
         for name, error in document.items():
             if error["available"]:
@@ -173,6 +176,7 @@ class AbsoluteTrajectoryError(TrajectoryMetric[dict[str, AbsoluteError]]):
 
 
 def _document(error: AbsoluteError) -> Document:
+    """JSON document of the error; statistics that are missing are None."""
     return {
         "recipe": error.recipe,
         "available": error.available,
@@ -189,6 +193,7 @@ def _document(error: AbsoluteError) -> Document:
 
 
 def _sentence(error: AbsoluteError, e: Evaluation) -> str:
+    """Error in words: rmse, maximum, share of the length and alignment; the note where it is not available."""
     if not error.available or error.translation is None:
         return error.note or "n/a"
     rotation = f", {error.rotation_deg.rmse:.3f} deg" if error.rotation_deg else ""
@@ -200,6 +205,7 @@ def _sentence(error: AbsoluteError, e: Evaluation) -> str:
 
 
 def _rows(name: str, errors: list[AbsoluteError]) -> list[MetricRow]:
+    """Rows of an alignment's errors, one cell per evaluation; only the first where none is available."""
     under = f"ATE {name}"
 
     def row(label: str, unit: str, pick: Callable[[AbsoluteError], str], under: str = under) -> MetricRow:

@@ -102,6 +102,7 @@ def time_range(trajectory: Trajectory, offset_ns: int = 0) -> str:
 
 
 def _by_index(estimate: Trajectory, truth: Trajectory) -> Matches:
+    """Pair pose i with pose i where a trajectory has no stamps. Raises InputError when the numbers of poses differ."""
     bare = [name for name, t in (("estimate", estimate), ("ground truth", truth)) if not t.has_stamps]
     who = " and ".join(bare) + (" have" if len(bare) == 2 else " has")
     if len(estimate) != len(truth):
@@ -128,6 +129,7 @@ def _interpolate(
     limit: int,
     recipe: str = "denser ground truth interpolated at the estimate's stamps",
 ) -> Matches:
+    """Pair estimated poses with the truth interpolated at `stamps`, outside its holes or within `limit` ns of a true pose."""
     known = truth.stamps_ns
     after = np.clip(np.searchsorted(known, stamps, side="left"), 1, len(known) - 1)
     gap = known[after] - known[after - 1]
@@ -152,6 +154,7 @@ def _matches(estimate: Floats, truth: Floats, stamps: Stamps, possible: int, rec
 
 
 def _no_overlap(estimate: Trajectory, stamps: Stamps, truth: Trajectory, count: int, max_diff: float) -> str:
+    """Message for only `count` matched poses: time ranges of both trajectories, and the option that can help."""
     ranges = (
         f"estimate {estimate.source} covers {stamps[0] / 1e9:.3f} .. {stamps[-1] / 1e9:.3f} s, "
         f"ground truth {truth.source} {time_range(truth)}"

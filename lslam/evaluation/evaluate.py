@@ -221,6 +221,7 @@ def _nearly_straight(truth: Floats, config: EvalConfig) -> list[str]:
 
 
 def _check(which: str, trajectory: Trajectory) -> None:
+    """Raise InputError for poses that are not finite, or stamps that do not increase."""
     name = trajectory.source or "without a name"
     if not np.isfinite(trajectory.poses).all():
         bad = int(np.flatnonzero(~np.isfinite(trajectory.poses).all(axis=(1, 2)))[0])
@@ -231,6 +232,10 @@ def _check(which: str, trajectory: Trajectory) -> None:
 
 
 def _offset(estimate: Trajectory, truth: Trajectory, config: EvalConfig) -> tuple[int, list[str]]:
+    """Time offset, ns, to add to the estimate's stamps, configured or estimated (`auto`), and notes on it.
+
+    Raises InputError without stamps, or where no offset can be estimated.
+    """
     if config.time_offset != "auto":
         offset = round(float(config.time_offset) * 1e9)
         if offset and not (estimate.has_stamps and truth.has_stamps):

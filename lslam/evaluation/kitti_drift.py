@@ -20,10 +20,7 @@ START_EVERY = 10
 
 @dataclass(frozen=True)
 class KittiDrift:
-    """KITTI's odometry metric: mean drift over all segments of 100..800 m.
-
-    by_length : length in m -> (translation %, rotation deg/100 m, segments)
-    """
+    """KITTI's mean drift over all segments of 100..800 m; by_length : m -> (translation %, rotation deg/100 m, segments)."""
 
     available: bool
     note: str
@@ -102,6 +99,7 @@ class KittiOdometry(TrajectoryMetric[KittiDrift]):
         return {"recipe": whole.pop("recipe"), **whole, "by_length": lengths}
 
     def summary(self, e: Evaluation) -> list[tuple[str, str]]:
+        """Mean drift in words; the note where it is not available."""
         drift = self.of(e)
         text = (
             f"{drift.translation_percent:.3f} %, {drift.rotation_deg_per_100m:.4f} deg/100 m "
@@ -121,6 +119,7 @@ class KittiOdometry(TrajectoryMetric[KittiDrift]):
         return [f"drift: {drift.recipe}; {count_of(drift.segments, 'segment') if drift.available else drift.note}"]
 
     def tables(self, e: Evaluation) -> list[Table]:
+        """Table of the drift: mean, and one row per segment length."""
         drift = self.of(e)
         header = ("segment length", "translation, %", "rotation, deg/100 m", "segments")
         rows = [("all", f"{drift.translation_percent:.3f}", f"{drift.rotation_deg_per_100m:.4f}", str(drift.segments))]

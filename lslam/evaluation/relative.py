@@ -139,6 +139,7 @@ def error_transforms(estimate: Floats, truth: Floats, pairs: Longs) -> Floats:
 
 
 def _pairs(poses: Floats, seconds: Floats | None, delta: float, unit: str, all_pairs: bool) -> Longs:
+    """Pairs (K, 2) of pose indices that are `delta` scans, m or s apart."""
     if unit == "scan":
         return by_index(len(poses), int(delta), all_pairs)
     if unit == "m":
@@ -170,6 +171,7 @@ class RelativePoseError(TrajectoryMetric[list[RelativeError]]):
         return [f"RPE {error.name}: {error.rule}, no alignment" for error in self.of(e)]
 
     def tables(self, e: Evaluation) -> list[Table]:
+        """Table of the errors, one row per pair rule."""
         rows = []
         for error in self.of(e):
             if error.translation is None or error.rotation_deg is None:
@@ -191,6 +193,7 @@ class RelativePoseError(TrajectoryMetric[list[RelativeError]]):
         return f"RPE {first.name} rmse", first.translation.rmse if first.translation else None, "m"
 
     def comparison_metrics(self, configs: Sequence[EvalConfig]) -> list[Metric]:
+        """Translation rmse of each pair rule of `configs` as main metric, rotation rmse as a further one."""
         deltas = list(dict.fromkeys(parse_delta(text) for config in configs for text in config.delta))
         metrics = []
         for delta, unit, pairs in deltas:
@@ -200,6 +203,7 @@ class RelativePoseError(TrajectoryMetric[list[RelativeError]]):
         return metrics + [Metric(key, key, "deg", "error", is_main=False) for key in rotations]
 
     def values(self, document: Any) -> dict[str, float]:
+        """Rmse of translation, m, and rotation, deg, by metric key, of the rules that have pairs."""
         values = {}
         for error in document:
             if error["n_pairs"]:
@@ -218,6 +222,7 @@ def rpe_key(delta: float, unit: str, pairs: str) -> str:
 
 
 def _document(error: RelativeError) -> Document:
+    """JSON document of the error; statistics that are missing are None."""
     return {
         "recipe": error.recipe,
         "delta": error.delta,
@@ -237,6 +242,7 @@ def _sentence(error: RelativeError) -> str:
 
 
 def _rows(errors: list[RelativeError]) -> list[MetricRow]:
+    """Rows of a pair rule's errors, one cell per evaluation; only the first where none has pairs."""
     under = f"RPE {errors[0].name}"
 
     def cells(pick: Callable[[RelativeError], str]) -> list[str]:

@@ -145,6 +145,7 @@ def judge(finding: ExpectedFinding, results: Sequence[CurveResult], products: Ma
 
 
 def _judge_one(finding: ExpectedFinding, result: CurveResult, results: Sequence[CurveResult]) -> Judged:
+    """Outcome and reason of a finding on one curve; undecided without usable runs, or where one seed shows no scatter."""
     curve = result.curve
     if curve.words and finding.kind not in _OF_WORDS:
         return "undecided", f"{curve.parameter} is not a number"
@@ -172,6 +173,7 @@ def _is_of_time(finding: ExpectedFinding) -> bool:
 
 
 def _speaks_of(finding: ExpectedFinding, result: CurveResult) -> bool:
+    """True when the finding concerns the curve's method, IMU and other parameters."""
     curve = result.curve
     return (
         finding.method in ("", curve.method)
@@ -195,6 +197,7 @@ def evaluate_study(rows: Sequence[StudyRow], findings: Sequence[ExpectedFinding]
 
 
 def _evaluate(rows: Sequence[StudyRow], beside: Sequence[StudyRow], findings: Sequence[ExpectedFinding]) -> StudyResult:
+    """Evaluate the runs of one sequence; `beside` are those outside the grid. Unusable runs of both are in `failed`."""
     limit = lost_above(rows)
     results = tuple(_result(curve) for curve in curves_of(rows, limit))
     products = _products(results)
@@ -213,6 +216,7 @@ def _evaluate(rows: Sequence[StudyRow], beside: Sequence[StudyRow], findings: Se
 
 
 def _result(curve: Curve) -> CurveResult:
+    """Means and medians over seeds of a curve, with divergence, optimal value of the parameter, and law of total time."""
     tables = {
         name: table if name in EFFICIENCIES else valid_runs(curve, name) for name, table in curve.quantities.items()
     }

@@ -166,6 +166,7 @@ class Girolimetto(TrajectoryMetric[AxisErrors]):
     axes = tuple(_more(f"thesis_{axis}", unit) for axes, unit in (("xyz", "m"), (RPY, "deg")) for axis in axes)
 
     def measure(self, poses: MatchedPoses, config: EvalConfig) -> AxisErrors:
+        """Errors per axis after alignment at the first pose; NaN with a note where the truth has no rotations."""
         if not poses.has_rotations:
             nan, three, none = float("nan"), (float("nan"),) * 3, np.full((len(poses.truth), 3), np.nan)
             return AxisErrors(
@@ -184,6 +185,7 @@ class Girolimetto(TrajectoryMetric[AxisErrors]):
         return [(self.name, f"{metres(self.of(e).thesis_rmse)} m (thesis_rmse, sqrt(sum|e|²/3N), origin alignment)")]
 
     def rows(self, es: Sequence[Evaluation]) -> list[MetricRow]:
+        """Rows of the scores, one cell per evaluation."""
         scores, below = [self.of(e) for e in es], self.name
         return [
             MetricRow("thesis1 thesis_rmse", "m", [significant(s.thesis_rmse) for s in scores]),
@@ -195,6 +197,7 @@ class Girolimetto(TrajectoryMetric[AxisErrors]):
         ]
 
     def tables(self, e: Evaluation) -> list[Table]:
+        """Table of the rmse per axis, m and deg."""
         s = self.of(e)
         header = (
             "",
@@ -226,6 +229,7 @@ class DelTufo(TrajectoryMetric[Planar]):
         return [(self.name, f"ATE {metres(s.ate_mean)} ± {metres(s.ate_std)} m (planar, mean ± std)")]
 
     def rows(self, es: Sequence[Evaluation]) -> list[MetricRow]:
+        """Rows of mean ± standard deviation, one cell per evaluation."""
         scores = [self.of(e) for e in es]
 
         def row(label: str, unit: str, key: str, below: str = self.name) -> MetricRow:
@@ -247,6 +251,7 @@ class DelTufo(TrajectoryMetric[Planar]):
         ]
 
     def tables(self, e: Evaluation) -> list[Table]:
+        """Table of mean and standard deviation of each error."""
         s = self.of(e)
         rows = (
             ("ATE, m", metres(s.ate_mean), metres(s.ate_std)),

@@ -32,10 +32,7 @@ HOLES = 5
 
 @dataclass(frozen=True)
 class OffsetFit:
-    """Result of `fit_offset`.
-
-    offset_ns : to add to the estimate's stamps; sigma_ns : one sigma of it; coherence : of the changes of both motions
-    """
+    """Offset to add to the estimate's stamps, its one sigma, ns, and the coherence of the changes of both motions."""
 
     offset_ns: int
     sigma_ns: float

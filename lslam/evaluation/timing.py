@@ -61,10 +61,7 @@ class Timing:
 
 
 def read_timing(path: str | Path) -> Timing:
-    """Read and summarise a `timing.csv`.
-
-    Raises InputError naming file and line when it is missing, empty or holds no numbers.
-    """
+    """Summarise a `timing.csv`. Raises InputError with file and line when it is missing, empty or holds no numbers."""
     rows = read_timing_rows(as_path(path))
     period = None
     if rows.stamps_ns is not None and len(rows.total) > 1:
@@ -109,6 +106,7 @@ def read_timing_rows(path: Path) -> TimingRows:
 
 
 def _table(path: Path) -> tuple[list[str], Floats]:
+    """Column names and finite values (N, C) of a CSV file; empty cells are 0. Raises InputError with the line of a bad one."""
     with (
         input_errors(f"timing {path}", UnicodeDecodeError, csv.Error),
         path.open(newline="", encoding="utf-8-sig") as stream,

@@ -200,6 +200,7 @@ def _as_most_seeds(says: Callable[[Curve], Judged], curve: Curve) -> Judged:
 
 
 def _diverges_beyond(curve: Curve, target: float) -> Judged:
+    """Judge that the method diverges just beyond `target`; undecided where that lies within a step of the last good value."""
     values, divergent = _scored_values(curve), divergence(curve)
     if divergent.first_bad is not None and divergent.last_good is None:
         outcome: Outcome = "undecided" if target < values[0] else "refuted"
@@ -219,6 +220,7 @@ def _diverges_beyond(curve: Curve, target: float) -> Judged:
 
 
 def _holds_up_to(curve: Curve, target: float) -> Judged:
+    """Judge that no value up to `target` diverges; undecided where no run is as large."""
     values, divergent = _scored_values(curve), divergence(curve)
     if divergent.first_bad is not None and divergent.first_bad <= target:
         below = -np.inf if divergent.last_good is None else divergent.last_good

@@ -183,6 +183,7 @@ def _keys(cells: Longs, origin: Longs) -> Keys:
 
 
 def _drive(evidence: Evidence) -> _Drive:
+    """Sorted keys of the drive's cells: observed, occupied, certain, free, possibly occupied; by the end state and the sum."""
     lowest, highest = int(MODEL[2]), int(MODEL[3])
     in_the_end, in_the_sum = evidence.log_odds, evidence.sums
     return _Drive(

@@ -249,6 +249,7 @@ class Cleaner:
         return [scan.select(~moves)]
 
     def _moves(self, scan: PosedScan, number: int) -> Bools:
+        """(N,) whether each point of scan `number` moved: the scans `OFFSETS` before and after it saw through its position."""
         around = (number + sign * offset for offset in OFFSETS for sign in (-1, 1))
         others = [self._looks[k - self._begin] for k in around if self._begin <= k < self._count]
         floors = [look.floor for look in (self._looks[number - self._begin], *others)]

@@ -30,10 +30,7 @@ _STEP = 1.0 / 255.0  # of a pixel's value: no two of them agree better than that
 
 @dataclass(frozen=True)
 class ColouredCloud:
-    """A cloud whose blocks have columns red, green and blue, uint8; satisfies `Cloud`.
-
-    colours : (M, 3) uint8, in the order of the cloud
-    """
+    """A cloud (satisfies `Cloud`) with columns red, green, blue; colours : (M, 3) uint8, in the cloud's order."""
 
     cloud: Cloud
     colours: NDArray[np.uint8]

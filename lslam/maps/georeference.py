@@ -40,10 +40,7 @@ def utm_epsg(lat: float, lon: float) -> int:
 
 @dataclass(frozen=True)
 class LocalFrame:
-    """Coordinates of a run without a georeference, where a `Projection` is expected: they stay as they are.
-
-    frame : description of the world
-    """
+    """Coordinates without a georeference in place of a `Projection`: they stay unchanged; frame : the world in words."""
 
     frame: str
 
@@ -143,10 +140,7 @@ class Projection:
         return self.frame.partition(", ")[2]
 
     def apply(self, points: NDArray[Any]) -> Floats:
-        """Transform points (N, 3) of the run's world, m, to (N, 3) easting, northing, height, m.
-
-        Raises UsageError where a grid of heights ends.
-        """
+        """Easting, northing, height (N, 3), m, of points (N, 3), m, world. Raises UsageError where a grid of heights ends."""
         enu = se3.apply(self.georeference.T_enu_world, np.asarray(points, np.float64).reshape(-1, 3))
         if self._is_vertical:
             places = from_local(enu, self.georeference.origin)

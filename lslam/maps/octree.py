@@ -151,6 +151,7 @@ class _Builder:
                 self.divide(f"{name}{k}", some, *cube_of(f"r{k}", low, edge))
 
     def _write(self, name: str, records: Records, low: Floats, edge: float) -> None:
+        """Append a node's `records`, shuffled, to the file; coordinates int16 within the cube from `low` with edge `edge`, m."""
         self.nodes[name] = (self._stream.tell(), len(records))
         # Any first part of them is spread over the node: while a map moves less of it is drawn.
         records = records[np.random.default_rng(0).permutation(len(records))]

@@ -135,10 +135,7 @@ class Resumable(Method, Protocol):
 
 
 class MapMethod(Traits, Stateful):
-    """Adapter from scans and motion priors to `Registration`.
-
-    is_scan_to_scan : whether the map is of the last scan alone
-    """
+    """Adapter from scans and motion priors to `Registration`; is_scan_to_scan : the map is the last scan alone."""
 
     is_searching = True
     STATE: ClassVar[tuple[str, ...]] = ("registration", "_uncertainty")

@@ -35,10 +35,7 @@ SURFACE_SIGMA_M = 0.1
 
 @dataclass(frozen=True)
 class FeatureScan:
-    """Less sharp edges and less planar points of a scan, world frame, in grids of cells of `size`, m.
-
-    reach : m, how far a counterpart may lie
-    """
+    """Less sharp edges and less planar points, world, in grids of cells of `size`, m; reach : m, farthest counterpart."""
 
     features: Features
     T_world_lidar: Floats

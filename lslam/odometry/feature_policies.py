@@ -24,10 +24,7 @@ CONSTRAINED_SCANS = 20
 
 
 class AllPoints(Stateful):
-    """A local map of all points with its own `icp`, maintained only while features are poorly constrained.
-
-    voxel_size : m, of that map
-    """
+    """Map of all points, in voxels of `voxel_size`, m, with its `icp`; only kept while features are poorly constrained."""
 
     STATE = ("_icp", "_fed")
 

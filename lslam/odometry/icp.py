@@ -42,10 +42,7 @@ def create(config: Config) -> Icp:
 def registration_of(
     config: Config, residual: str | None = "plane", recovery: RecoveryConfig | None = None, **keys: Any
 ) -> Registration:
-    """A registration of points as the configuration wants it, but by this residual and these keys of its section.
-
-    recovery : None: as configured
-    """
+    """Registration of points as configured, but with this residual, section and, unless it is None, this `recovery`."""
     c = config.registration.model_copy(update={"residual": residual, **keys})
     return Registration(c, config.preprocess, recovery or config.recovery)
 

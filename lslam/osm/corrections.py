@@ -308,10 +308,7 @@ def _counts(
 
 @dataclass(frozen=True)
 class BuildingFit:
-    """Matches, and buildings with their displacements.
-
-    joint : solution of buildings and trajectory in one graph; None when the trajectory is fixed
-    """
+    """Matches, and displacements of buildings; joint : solution of one graph, None when the trajectory is fixed."""
 
     matches: OsmMatches
     buildings: CorrectedMap
@@ -346,10 +343,7 @@ def lay(
 def join_buildings(
     graph: PoseGraph, solution: Solution, matches: OsmMatches, config: Config
 ) -> tuple[JointSolution, CorrectedMap]:
-    """Mode `non-rigid`: one graph of all buildings and of the inliers of `solution` in `graph`.
-
-    Raises GraphError when it cannot be solved.
-    """
+    """Solve one graph of all buildings and the inliers of `solution` (mode `non-rigid`); GraphError when it is singular."""
     accepted = replace(
         accepted_part(graph, solution),
         poses=solution.poses,

@@ -329,10 +329,7 @@ def _kept_replies(folder: Path) -> OsmData:
 
 
 def start_of(sequence: Sequence, config: Config) -> Floats:
-    """Approximate origin (3,) of the run, lat, lon (deg), height (m): as configured, or its first fix.
-
-    Raises UsageError when there is neither.
-    """
+    """Approximate origin (3,), lat, lon (deg), height (m), configured or the first fix's; UsageError without either."""
     if config.osm.origin is not None:
         return np.array(config.osm.origin, np.float64)
     gnss = sequence.gnss if config.gnss.mode != "off" else None

@@ -57,10 +57,7 @@ class WallSightings:
 
 @dataclass(frozen=True)
 class Sizes:
-    """Hyperparameters.
-
-    noise : scale of the configured sigma of a sighting; root : (P, P) square root of the prior covariance of the rates
-    """
+    """Hyperparameters: noise : scale of the configured sigma; root : (P, P) square root of the rates' prior covariance."""
 
     noise: float
     root: Floats

@@ -174,10 +174,7 @@ def _simplify(footprint: Footprint) -> Footprint:
 
 
 class OsmMap:
-    """Buildings and their walls, in the map frame.
-
-    walls : (T, 2, 2) m; owners : (T,) number of each one's building
-    """
+    """Buildings and their walls (T, 2, 2), m, map frame; owners : (T,) number of each one's building."""
 
     def __init__(self, buildings: Sequence[Building]) -> None:
         self.buildings = tuple(buildings)

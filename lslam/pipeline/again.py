@@ -176,10 +176,7 @@ def _content(file: Path) -> bytes:
 
 
 def open_again(run: EarlierRun, sequence: Path | None = None, **reading: Any) -> Sequence:
-    """Recording of the run, with the streams that its configuration needs; `reading` overrides the run's options.
-
-    Raises InputError when it is gone.
-    """
+    """Recording of the run and the streams it needs; `reading` overrides the run's options. InputError if it is gone."""
     return open_recording(recording_of(run, sequence), run.config, **reading_of(run, sequence, **reading))
 
 

@@ -170,10 +170,7 @@ def motion_of(results: list[ScanResult]) -> ContinuousMotion:
 
 @dataclass(frozen=True)
 class FeatureCloud:
-    """One averaged point per voxel and kind, world frame.
-
-    points : (M, 3) float64, m; kinds : (M,) uint8, EDGE 1 or PLANE 0
-    """
+    """Averaged points (M, 3), m, world, one per voxel and kind; kinds : (M,) uint8, EDGE 1 or PLANE 0."""
 
     points: Floats
     kinds: NDArray[np.uint8]

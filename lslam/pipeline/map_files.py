@@ -161,10 +161,7 @@ def write_run_map(
     world: str,
     georeference: Georeference | None,
 ) -> None:
-    """Write the map of a run and, if configured, a surface mesh, the occupancy, and the trajectory as GeoJSON.
-
-    Raises as `write_map`.
-    """
+    """Write the run's map, and as configured mesh, occupancy and trajectory as GeoJSON; raises as `write_map`."""
     note = MapNote.of(sequence, config, built, world)
     write_map(path, built.cloud, note, georeference)
     if config.mesh:

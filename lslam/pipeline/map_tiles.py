@@ -74,10 +74,7 @@ def rebuild_in_tiles(
     crs: OutputCrs | None = None,
     watch: Watch = SILENT,
 ) -> dict[str, Any]:
-    """Build the map of a run again, in tiles of `size` m, in `folder`, checked by `check_tiles`. Returns the index.
-
-    Raises as `rebuild` does.
-    """
+    """Build a run's map again, in tiles of `size` m in the checked `folder`; returns the index. Raises as `rebuild`."""
     georeference = place_of(run, crs)
     built = build_finished_map(sequence, results_of(run), run.config, watch, folder)
     if watch.should_stop():

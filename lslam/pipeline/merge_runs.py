@@ -69,10 +69,7 @@ class Merge:
 
 
 def expand_folders(folders: Sequence[Path]) -> list[Path]:
-    """Run folders, where a merged folder is replaced by its runs.
-
-    Raises InputError for a folder that is no run, UsageError for fewer than two or a duplicate.
-    """
+    """Run folders, merges replaced by their runs. Raises InputError for no run, UsageError for fewer than two or a duplicate."""
     out: list[Path] = []
     for folder in folders:
         inside = sessions_of(folder)

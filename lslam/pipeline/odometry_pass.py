@@ -195,10 +195,7 @@ def odometry_checkpoints(folder: RunFolder, job: PreparedRun, goes_on: bool) -> 
 
 
 def _warm_up(job: PreparedRun, stationary: StationaryDetector | None, monitor: IntegrityMonitor | None) -> None:
-    """Compile or load the kernels of the run, fewer when its odometry is done already.
-
-    A process loads the kernels of one configuration once, for all its runs.
-    """
+    """Compile or load the run's kernels, fewer if odometry is done; once per process and configuration."""
     config, is_over = job.config, job.checkpoints is not None and job.checkpoints.is_over
     alike = type(job.odometry), bool(config.osm.extract), repr(config.model_dump(exclude=_WITHOUT_KERNELS))
     count = COUNTS.get(config.odometry.method)

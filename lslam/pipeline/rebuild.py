@@ -324,10 +324,7 @@ def covariances_of(run: EarlierRun) -> Floats | None:
 
 
 def _statuses(path: Path, count: int) -> tuple[Status, ...]:
-    """Status of each scan, by scans.csv; all `ok` without that file. Scans of another frame count as bridged.
-
-    Raises InputError for a damaged table.
-    """
+    """Status of each scan by scans.csv, `bridged` for other frames, all `ok` without the file; InputError if damaged."""
     known: dict[str, Status] = {"ok": "ok", "bridged": "bridged", "skipped": "skipped"}
     try:
         with path.open(newline="", encoding="utf-8", errors="replace") as stream:

@@ -63,10 +63,7 @@ def input_digest(sequence: Sequence, truth: Trajectory | None) -> str:
 
 
 def listing_digest(path: Path) -> str:
-    """As `input_digest`, for a recording that is not opened: its content follows from its files.
-
-    Raises InputError when it cannot be listed.
-    """
+    """`input_digest` of an unopened recording, by its listing. Raises InputError when it cannot be listed."""
     return _listing(path, 0).hexdigest()
 
 
@@ -93,10 +90,7 @@ def imu_digest(sequence: Sequence) -> str:
 
 
 def job_digest(config: Config, of_input: str, of_imu: str = "") -> str:
-    """Digest of a run: its resolved configuration, input, IMU if used, and lslam's version.
-
-    Which metrics are shown makes no other run.
-    """
+    """Digest of a run's configuration, except metrics shown, of input, IMU if used, and lslam's version."""
     tree = config.model_dump(mode="json", exclude={"eval": {"metrics"}})
     content: dict[str, Any] = {"config": tree, "input": of_input, "lslam": __version__}
     if config.imu.use:

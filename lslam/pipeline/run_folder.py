@@ -118,10 +118,7 @@ class RunFolder:
                     _share(file, self.path / KEYFRAMES / name)
 
     def begin_from(self, run: Path) -> None:
-        """Link or copy keyframes and odometry of another run into this folder, unless they are there.
-
-        Raises OutputError when they cannot be written.
-        """
+        """Link or copy another run's keyframes and odometry unless they exist. Raises OutputError if it fails."""
         source = run / KEYFRAMES
         if any((self.path / CHECKPOINT).glob("odometry-*.npz")):
             return  # the last of the files that are laid there
@@ -360,10 +357,7 @@ def check_place(place: RemotePath, may_replace: bool) -> None:
 
 
 def upload(folder: Path, place: RemotePath) -> None:
-    """Upload the run in `folder` to `place`, the manifest last, then delete `folder`.
-
-    Raises StorageError naming the folder where the results are.
-    """
+    """Upload the run to `place`, manifest last, delete `folder`. Raises StorageError naming the results' folder."""
     files = [path for path in sorted(folder.rglob("*")) if path.is_file() and _is_result(path.relative_to(folder))]
     names = [path.relative_to(folder).as_posix() for path in files]
     try:

@@ -202,10 +202,7 @@ def in_folder(
 
 
 def _begin(job: PreparedRun, folder: RunFolder, goes_on: bool, earlier: EarlierRun | None) -> PreparedRun:
-    """The run in its folder, with a manifest that marks it as running.
-
-    Raises InputError when the odometry of the earlier run cannot be read.
-    """
+    """The run in its folder, its manifest `running`. Raises InputError if an earlier run's odometry is unreadable."""
     folder.require_space(outputs.least_bytes(len(job.sequence)), "the result without its map")
     job = fit_to_scene(job, load_config(folder.path / "config.toml", environ={}) if goes_on else None)
     folder.write_text("config.toml", outputs.config_text(job.config))

@@ -45,10 +45,7 @@ class StoredMap:
         return points if place is None or self.note.get("crs") is None else Projection(place).invert(points)
 
     def read(self, in_world: bool = True) -> ArrayCloud:
-        """All points and their intensities, in the world of the run or as the files have them.
-
-        Raises InputError naming a file that is damaged.
-        """
+        """Points and intensities, in the run's world or as in the files. Raises InputError naming a damaged file."""
         parts = [read_cloud(path) for path in self.files]
         values = [part.intensity for part in parts if part.intensity is not None]
         intensity = np.concatenate(values) if len(values) == len(parts) else None

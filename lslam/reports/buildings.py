@@ -127,6 +127,7 @@ def building_tables(result: CorrectedMap, matches: OsmMatches) -> list[Table]:
 
 
 def _row(correction: BuildingCorrection) -> tuple[str, ...]:
+    """Cells of a correction: building, status, shift east and north, m, yaw, deg, confidence, used and rejected matches."""
     east, north, yaw = correction.displacement
     name = correction.building.tags.get("name", "")
     return (

@@ -98,6 +98,7 @@ def _section(
     crop: Crop | None,
     may_have_map: bool,
 ) -> SequenceSection:
+    """Section of one sequence: figures, map where there may be one, crops, and links to the pages of its runs."""
     figures: list[Figure] = []
     crops: list[list[Figure]] = []
     map_shown = None
@@ -322,10 +323,7 @@ SESSION_RECIPE = "ATE of each session by itself, se3, m rmse; found by keyframes
 
 @dataclass(frozen=True)
 class SessionView:
-    """One session in the common world.
-
-    Positions (N, 3), m, as it was connected to the others and after the pose graph; numbers (N,) of its scans.
-    """
+    """A session in the common world: positions (N, 3), m, as connected and after the pose graph; numbers (N,) of scans."""
 
     name: str
     before: Floats
@@ -375,6 +373,7 @@ def write_merge_page(
 
 
 def _session_table(rows: Sequence[Mapping[str, Any]]) -> Table:
+    """Table of merged sessions: scans, keyframes, localised keyframes, loops with others, errors before and after, m."""
     header = ("session", "scans", "keyframes", "found by", "loops with others", "ATE alone, m", "ATE merged, m")
     texts = []
     for row in rows:

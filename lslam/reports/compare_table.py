@@ -134,6 +134,7 @@ def write_files(out: Path, comparison: Comparison) -> None:
 
 
 def _methods_table(comparison: Comparison, groups: Sequence[str], title: str) -> CompareTable:
+    """Table of the main metrics in `groups`, one row per sequence and method, with the best values marked."""
     metrics = [m for m in comparison.metrics if m.is_main and m.group in groups and m.key not in HEALTH]
     header = ["sequence", "method", *(f"{m.label}, {m.unit}" if m.unit != "x" else f"x {m.label}" for m in metrics)]
     header += ["/".join(HEALTH.values()), "runs"] if "health" in groups else []
@@ -152,6 +153,7 @@ def _methods_table(comparison: Comparison, groups: Sequence[str], title: str) ->
 
 
 def _cell(metric: Metric, row: SummaryRow) -> str:
+    """Mean over seeds, with the standard deviation of an error; `~` before a time of runs that shared the machine."""
     value = row.values.get(metric.key)
     if value is None:
         return "-"
@@ -186,6 +188,7 @@ def _is_best(metric: Metric, row: SummaryRow, rivals: Sequence[SummaryRow]) -> b
 
 
 def _pairs(comparison: Comparison) -> CompareTable:
+    """Table of the paired comparisons with the reference."""
     header = ("method", "against", "pairs", "ratio of ATE", "wins/ties/losses", "p")
     rows = []
     for pair in comparison.pairs:
@@ -263,6 +266,7 @@ def _head(command: str, status: str) -> dict[str, Any]:
 
 
 def _run(run: RunScore) -> dict[str, Any]:
+    """JSON document of one run."""
     values = asdict(run)
     values["folder"] = str(values["folder"])
     values["stages_s"] = values.pop("stages")

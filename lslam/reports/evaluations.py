@@ -94,10 +94,7 @@ def strict(value: Any) -> Any:
 
 
 def render(evaluations: Sequence[Evaluation], timings: Sequence[Timing | None] = (), style: str = "text") -> str:
-    """A table of evaluations against one ground truth; `style` is one of STYLES. Ends without a line break.
-
-    Raises ValueError for an unknown style.
-    """
+    """Table of evaluations against one ground truth, `style` one of STYLES, without final line break; else ValueError."""
     rows = [row for metric in shown_metrics(evaluations[0]) for row in metric.rows(evaluations)]
     if any(timings):
         rows += _timing_rows([*timings, *[None] * (len(evaluations) - len(timings))])
@@ -117,6 +114,8 @@ def render(evaluations: Sequence[Evaluation], timings: Sequence[Timing | None] =
 
 
 def _timing_rows(timings: Sequence[Timing | None]) -> list[MetricRow]:
+    """Rows of median, 95 % quantile and maximum of each stage, ms, and of scans slower than the sensor."""
+
     def cell(stage: StageTime | None) -> str:
         return "-" if stage is None else " / ".join(significant(1e3 * v) for v in (stage.median, stage.p95, stage.max))
 
@@ -131,6 +130,7 @@ def _timing_rows(timings: Sequence[Timing | None]) -> list[MetricRow]:
 
 
 def _head(evaluations: Sequence[Evaluation], names: list[str]) -> list[str]:
+    """Lines on ground truth, estimates, matched poses and notes."""
     lines = [f"ground truth  {evaluations[0].ground_truth}"]
     for e, name in zip(evaluations, names, strict=True):
         shift = f", time offset {e.time_offset:.6f} s" if e.time_offset else ""

@@ -60,10 +60,7 @@ def require_figure(what: str) -> None:
 
 
 def draw_figure(run: PlottedRun, what: str, width: float = WIDTHS["column"]) -> Any:
-    """matplotlib figure, `width` mm wide.
-
-    Raises UsageError as `require_figure`, InputError for data that the run does not have.
-    """
+    """matplotlib figure, `width` mm wide. Raises UsageError as `require_figure`, InputError for missing data of the run."""
     require_figure(what)
     draw, height = FIGURES[what]
     figure = shown_figure()(figsize=(width / INCH, height * width / INCH), layout="constrained")
@@ -80,6 +77,7 @@ def _map(figure: Any, run: PlottedRun) -> None:
 
 
 def _trajectory(figure: Any, run: PlottedRun) -> None:
+    """Draw trajectory, odometry and ground truth from above and in 3D."""
     from matplotlib.ticker import MaxNLocator
 
     above, deep = figure.add_subplot(2, 1, 1), figure.add_subplot(2, 1, 2, projection="3d")
@@ -134,6 +132,7 @@ def _errors(figure: Any, run: PlottedRun) -> None:
 
 
 def _imu(figure: Any, run: PlottedRun) -> None:
+    """Draw the IMU's force and rates, and the trajectory's speed and yaw rate, over time; InputError without IMU."""
     if run.imu is None:
         raise InputError(f"{run.name} has no IMU: what it was run without is not plotted")
     force, rates, speed, yaw = figure.subplots(4, 1, sharex=True)
@@ -154,6 +153,7 @@ def _imu(figure: Any, run: PlottedRun) -> None:
 
 
 def _features(figure: Any, run: PlottedRun) -> None:
+    """Draw features of one scan and of the map from above; raises InputError for a run without features."""
     view = run.features
     if view is None:
         raise InputError(f"{run.name} has no features: a method of the LOAM family has some")
@@ -173,6 +173,7 @@ def _features(figure: Any, run: PlottedRun) -> None:
 
 
 def _buildings(figure: Any, run: PlottedRun) -> None:
+    """Draw mapped and corrected buildings with the trajectory, ENU; raises InputError for a run without buildings."""
     if run.buildings is None or run.georeference is None:
         raise InputError(f"{run.name} has no buildings: run it with --osm")
     plot = figure.add_subplot()
@@ -295,6 +296,7 @@ def write_recording(path: Path, run: PlottedRun) -> None:
 
 
 def _log(rr: Any, stream: Any, run: PlottedRun) -> None:
+    """Write trajectories, map and poses of the run to a Rerun stream."""
     stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     ways = {"trajectory": (run.trajectory, _ESTIMATE), "odometry": (run.odometry, _ODOMETRY)}
     for name, (way, colour) in ways.items():

@@ -181,6 +181,7 @@ def map_context(record: RunRecord) -> dict[str, Any]:
 
 
 def _map_figure(record: RunRecord) -> MapFigure | None:
+    """Figure of the map with trajectory, localised keyframes and changes; None without a map image."""
     if record.map_image is None:
         return None
     tracks, legend = [Track("trajectory", record.trajectory.positions[:, :2], "s2", ends=True)], [("s2", "trajectory")]

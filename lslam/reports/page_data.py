@@ -82,6 +82,7 @@ def _against_map(record: RunRecord) -> dict[str, Any]:
 
 
 def _truth(trajectory: Trajectory, evaluation: Evaluation) -> dict[str, Any]:
+    """Errors, m, aligned trajectory and ground truth for the page; empty where no alignment is available."""
     absolute = first_available(evaluation)
     if absolute is None:
         return {}
@@ -252,10 +253,7 @@ FROM_ABOVE = "The more voxels of a column are occupied, the stronger it is drawn
 
 @dataclass(frozen=True)
 class MapFigure:
-    """A map from above.
-
-    It has an image, and the range of heights that colours stand for, m (None for a grey one).
-    """
+    """A map from above: an image, and the heights that its colours stand for, m (None for a grey one)."""
 
     figure: Figure
     heights: tuple[float, float] | None

@@ -99,6 +99,7 @@ def write_plot(path: str | Path, evaluations: Sequence[Evaluation], names: Seque
 
 
 def _draw(evaluations: Sequence[Evaluation], names: Sequence[str]) -> Any:
+    """Figure of one or more evaluations: trajectories, errors over distance, errors per axis of the first, and drift."""
     import numpy as np
     from matplotlib.figure import Figure
 
@@ -125,6 +126,7 @@ def _draw(evaluations: Sequence[Evaluation], names: Sequence[str]) -> Any:
 def _trajectories(
     above: Any, height: Any, evaluations: Sequence[Evaluation], names: Sequence[str], errors: Sequence[AbsoluteError]
 ) -> None:
+    """Draw aligned estimates and ground truth from above (`above`), and their height over distance (`height`)."""
     first = evaluations[0]
     above.plot(*first.gt_positions[:, :2].T, color="black", lw=2.5, alpha=0.35, label="ground truth")
     height.plot(first.distance, first.gt_positions[:, 2], color="black", lw=2.5, alpha=0.35)

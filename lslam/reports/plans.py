@@ -90,6 +90,7 @@ def _at(x_mm: float, y_mm: float) -> tuple[float, float]:
 
 
 def _draw_map(figure: Any, sheet: SurveySheet) -> None:
+    """Draw the map to scale with trajectories, scans without registration, and points."""
     plot = figure.add_axes((*_at(_MARGIN + 4, _MAP_LOW_MM), *_at(*_MAP_MM)))
     low, high = np.array(sheet.extent[::2]), np.array(sheet.extent[1::2])
     size_m = 1e-3 * np.array(_MAP_MM)

@@ -344,6 +344,7 @@ def draw_laws(figure: Any, result: StudyResult, curves: Sequence[CurveResult]) -
 
 
 def _single(upper: Any, lower: Any, law: Law, curve: str, colour: str) -> None:
+    """Draw a law with its band and points into `upper`, relative residuals, %, into `lower`."""
     x = law.points[:, 0]
     line = np.linspace(x.min(), x.max(), SAMPLES)
     fitted, half = band(law, line)

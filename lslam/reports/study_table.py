@@ -100,6 +100,7 @@ def _verdicts(result: StudyResult) -> CompareTable:
 
 
 def _landmarks(result: StudyResult) -> CompareTable:
+    """Table of divergence, best values and lost runs of each curve."""
     header = ("method", "diverges from", "last good value", "best E at", "within 10 %", "least error at", "lost/runs")
     rows = []
     for r in result.results:
@@ -116,6 +117,7 @@ def _landmarks(result: StudyResult) -> CompareTable:
 
 
 def _laws(result: StudyResult) -> CompareTable:
+    """Table of the laws of total time, or of the reason why there is none."""
     header = ("method", "total time, s", "coefficients at 99 %", "R2", "largest residual", "points")
     rows = [_law_row(series, law) for series, law in result.products.items()]
     for r in result.results:
@@ -134,6 +136,7 @@ def _law_row(name: str, law: Law) -> tuple[str, ...]:
 
 
 def _means(result: StudyResult) -> CompareTable:
+    """Table of means over seeds at each value, with normalised efficiencies; 1 is marked as the best."""
     key = result.parameters[0]
     head = (
         "method",
@@ -166,6 +169,7 @@ def _beside(result: StudyResult) -> CompareTable:
 
 
 def _failures(result: StudyResult) -> CompareTable:
+    """Table of the runs without a result, with outcome and reason."""
     rows = tuple(
         (
             row.series,
@@ -187,6 +191,7 @@ def _numbers(row: StudyRow) -> Iterable[str]:
 
 
 def _mean(means: Interval, v: int, name: str) -> str:
+    """Mean over seeds at value number v in the decimals of the quantity, ± half of the confidence interval."""
     mean = float(means.mean[v])
     if not math.isfinite(mean):
         return UNKNOWN
@@ -270,6 +275,7 @@ def rows_document(rows: Sequence[StudyRow]) -> list[dict[str, Any]]:
 
 
 def _best(rows: Sequence[StudyRow]) -> tuple[StudyRow, ...]:
+    """Rows of the parameters with the smallest mean error, of which no run failed; empty without one."""
     points: dict[str, list[StudyRow]] = {}
     for row in rows:
         points.setdefault(repr(row.parameters), []).append(row)
@@ -283,6 +289,7 @@ def _best(rows: Sequence[StudyRow]) -> tuple[StudyRow, ...]:
 
 
 def _line(best: Best) -> list[str]:
+    """Cells of the best parameters of a method, with mean errors and time."""
     head = [best.sequence, best.method, str(best.runs), str(best.failures)]
     if not best.point:
         return [*head, "-", "-", "-", "-"]

@@ -75,6 +75,7 @@ def summary(record: RunRecord, evaluation: Evaluation | None) -> str:
 
 
 def _scan_rows(facts: RunFacts) -> list[tuple[str, str]]:
+    """Rows on scans: numbers by status, and the first failures."""
     parts = [f"{facts.registered} of {facts.scans} registered"]
     others = ((facts.standing, "standing"), (facts.bridged, "bridged"), (facts.skipped, "skipped"))
     parts += [f"{n} {word}" for n, word in others if n]
@@ -192,6 +193,7 @@ def _map_rows(record: RunRecord) -> list[tuple[str, str]]:
 
 
 def _time_rows(record: RunRecord, facts: RunFacts) -> list[tuple[str, str]]:
+    """Rows on time: per scan and stage, ms, real-time factor, and back end, s."""
     if facts.total is None:
         return [("time", "no stage was timed")]
     total = facts.total

@@ -279,10 +279,7 @@ def _add_front_garden(site: StreetSite, width: float, setback: float, front: Flo
 def add_street_furniture(
     site: StreetSite, side: int, is_free: Callable[[Floats, float, float], bool] | None = None
 ) -> None:
-    """Add parked cars, trees, poles and bins along one side.
-
-    `is_free` returns whether an object at (2,), with its offset, m, and yaw, has room.
-    """
+    """Add parked cars, trees, poles and bins along one side; `is_free`: has an object at (2,), offset, m, and yaw, room?"""
     street, layout, rng = site.street, site.layout, site.rng
 
     def place(part: SceneMesh, s: float, offset: float, lift: float, turn: float = 0.0) -> None:

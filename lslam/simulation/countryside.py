@@ -94,10 +94,7 @@ def build_corridor(street: RouteCurve, terrain: Terrain, layout: Layout, rng: np
 
 
 def _fill_opening(site: StreetSite, s: float, side: int) -> tuple[Floats, float]:
-    """Add a house behind an opening of the barrier, and lamps, a cabinet and two trees before it.
-
-    Returns the house's outline and height.
-    """
+    """Add a house behind an opening, and lamps, a cabinet, two trees before it; returns its outline and height."""
     layout, rng = site.layout, site.rng
     for lamp in (s + rng.uniform(-12, -6), s + rng.uniform(6, 12)):
         _add_box(site, lamp, side * layout.band, [-0.08, -0.08, -0.3], [0.08, 0.08, 7.0], Surface.POLE)

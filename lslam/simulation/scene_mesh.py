@@ -78,10 +78,7 @@ def is_glass(surfaces: NDArray[np.uint8]) -> Bools:
 
 @dataclass(frozen=True)
 class SceneMesh:
-    """Triangles in one frame.
-
-    vertices : (V, 3) float32, m; faces : (F, 3) int32 indices of vertices; surfaces : (F,) uint8 values of `Surface`
-    """
+    """Triangles: vertices (V, 3) float32, m; faces (F, 3) int32 indices; surfaces (F,) uint8 values of `Surface`."""
 
     vertices: NDArray[np.float32]
     faces: NDArray[np.int32]

@@ -84,10 +84,7 @@ def _client(scheduler: str) -> Any:
 
 @dataclass
 class Cluster:
-    """Workers of a Dask scheduler.
-
-    is_here : workers share this machine's disk; is_persistent : workers cache sequences between runs, and delete keyframes
-    """
+    """Workers of a Dask scheduler: is_here : on this disk; is_persistent : they cache sequences and delete keyframes."""
 
     client: Any
     address: str

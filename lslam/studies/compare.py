@@ -103,6 +103,7 @@ def draw(jobs: Sequence[Job], scores: Sequence[RunScore]) -> tuple[list[Drawing]
 
 
 def _draw(jobs: Sequence[Job], scores: Sequence[RunScore]) -> tuple[list[Drawing], list[Difference]]:
+    """Trajectories of usable runs with the first seed by sequence, and, without ground truth, differences of the methods."""
     drawings, differences = [], []
     groups: dict[str, list[UsableRun]] = {}
     for job, score in zip(jobs, scores, strict=True):
@@ -126,6 +127,7 @@ def _draw(jobs: Sequence[Job], scores: Sequence[RunScore]) -> tuple[list[Drawing
 
 @contextmanager
 def _only_warnings() -> Iterator[None]:
+    """Context in which the log shows warnings and errors only."""
     before = log.level
     log.setLevel(max(before, logging.WARNING))
     try:
@@ -137,6 +139,7 @@ def _only_warnings() -> Iterator[None]:
 def _in_world_of_truth(
     sequence: str, seed: int, runs: Sequence[UsableRun], recording: Recording, truth: Trajectory
 ) -> Drawing:
+    """Drawing of runs in the truth's frame; all by the alignment at the first pose where another one would turn a run much."""
     scores = [evaluate(run.trajectory, truth, PAIR_EVALUATION, calibration=recording.calibration) for run in runs]
     errors = [_available(list(score.ate.values())) for score in scores]
     turns = [_turn_about_path(error, score.gt_positions) for error, score in zip(errors, scores, strict=True)]
@@ -287,6 +290,7 @@ def _notes(scores: Sequence[RunScore]) -> list[str]:
 
 
 def _weigh(plan: Plan, jobs: Sequence[Job], scores: Sequence[RunScore]) -> tuple[Comparison, list[Drawing]]:
+    """Comparison of the scores of `jobs`, and drawings of their trajectories."""
     drawings, differences = draw(jobs, scores)
     methods = tuple(variant.name for variant in plan.variants)
     return Comparison(

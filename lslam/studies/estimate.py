@@ -32,10 +32,7 @@ _MOST_SCANS = 160
 
 @dataclass(frozen=True)
 class Guess:
-    """Estimated duration.
-
-    seconds : of everything; pilots : number of runs behind it; around_s : part of the seconds before and after the runs
-    """
+    """Estimated seconds of everything, of which `around_s` before and after the runs; pilots : runs behind it."""
 
     seconds: float
     pilots: int
@@ -171,6 +168,7 @@ def _to_simulate(jobs: Sequence[Job]) -> list[Job]:
 
 
 def _places(jobs: Sequence[Job], folder: Path, progress: StudyProgress) -> dict[str, _PilotRecording]:
+    """Recordings for pilot runs by sequence, simulated in `folder` where missing, with the seconds of a whole simulation."""
     places: dict[str, _PilotRecording] = {}
     for job in jobs:
         if job.sequence in places:

@@ -209,6 +209,7 @@ def cells_of(
 
 
 def _recording_cell(word: str, own: ScanRange, needs_imu: bool, output: OutputOptions, may_fail: bool) -> Cell:
+    """Cell of the recording `word`. Raises InputError when it cannot be opened; if `may_fail`, the cell holds it as `refusal`."""
     path = as_path(word).expanduser().absolute()
     try:
         path = find_folder(word, output.data_root).absolute()
@@ -226,6 +227,7 @@ def _recording_cell(word: str, own: ScanRange, needs_imu: bool, output: OutputOp
 def _scene_cells(
     s: StudySequence, own: ScanRange, count: int | None, seeds: Sequence[int], output: OutputOptions
 ) -> list[Cell]:
+    """Cell of the scenario for each seed; digests stand in for simulations that do not exist yet."""
     scene = Scene(s.scenario, s.scans, s.lidar, s.columns, s.speed, s.compensated, s.imu, s.settings)
     scene = fit_scene(scene, count, own, seeds)
     parent = output.scenes or output.out / SIMULATED

@@ -99,10 +99,7 @@ def study_names() -> tuple[str, ...]:
 
 
 def find_study(word: str) -> StudyConfig:
-    """The study of a TOML file, else the ready one of that name.
-
-    Raises UsageError with the nearest name for what is neither, and what `read_study` raises.
-    """
+    """Study of a TOML file or a ready one. Raises UsageError with the nearest name for neither, or as `read_study`."""
     from lslam.core.config.config import read_package_files
     from lslam.core.config.study import parse_study, read_study
 

@@ -79,6 +79,7 @@ def _run_of(table: dict[tuple[str, str, int], RunScore], sequence: str, method: 
 
 
 def _judge(method: str, reference: str, pairs: list[tuple[RunScore, RunScore]]) -> PairedComparison:
+    """Compare a method with the reference: mean ratio of errors, wins, ties and losses, and p of the signed-rank test."""
     wins = ties = losses = 0
     logs = []
     for of_reference, of_method in pairs:

@@ -202,6 +202,7 @@ class ReadyComparison(Section):
         return on_map
 
     def _map(self, kind: str, cell: Cell, out: Path) -> Path:
+        """Map file of a kind for a cell: exact, as simulated, given, or with random errors, which is written below `out`."""
         errors = self.maps[kind]
         if errors == MapKind():
             return cell.path / EXACT
@@ -225,6 +226,7 @@ class ReadyComparison(Section):
         return self._numbers(runs), self._statements(runs), self._further(runs)
 
     def _numbers(self, runs: Sequence[RunScore]) -> Table:
+        """Table of the thesis's numbers, ours, and the verdict on each."""
         rows = []
         for sequence, method in dict.fromkeys((run.sequence, run.method) for run in runs):
             printed = {of: value for of, value, _ in self._of(sequence, method)}
@@ -244,6 +246,7 @@ class ReadyComparison(Section):
         return Table("beside the thesis, number by number", header, tuple(rows), recipe)
 
     def _further(self, runs: Sequence[RunScore]) -> Table:
+        """Table of quantities for which the thesis prints no number."""
         rows = [
             (
                 sequence,
@@ -265,6 +268,7 @@ class ReadyComparison(Section):
         return next((value for kind, value, _ in self._of(sequence, method) if kind == of), None)
 
     def _statements(self, runs: Sequence[RunScore]) -> Table:
+        """Table of the thesis's orderings of methods, with the verdict by runs of equal seed."""
         rows = []
         scores = list(dict.fromkeys((run.sequence, run.method) for run in runs))
         for claim in self.claims:

@@ -98,6 +98,7 @@ def _with_values(score: RunScore, state: State) -> RunScore:
 
 
 def _read_json(path: Path) -> dict[str, Any]:
+    """Object in a JSON file; raises InputError when it is unreadable or no object."""
     try:
         tree = parse_json(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
@@ -183,10 +184,7 @@ def _more(key: str, unit: str, group: Group) -> Metric:
 
 
 class Results:
-    """Rows of finished runs in the order of the study; the files are whole at any moment.
-
-    Those of thousands of runs may be some seconds behind, until `flush`.
-    """
+    """Rows of finished runs in the study's order, in whole files, some seconds late for thousands, until `flush`."""
 
     def __init__(
         self, study: str, out: Path, jobs: Sequence[Job], variants: dict[str, Variant], metric: str = "ate_se3"
@@ -228,6 +226,7 @@ class Results:
         self._next_s = ended + (_PARTS * (ended - began) if len(self._rows) >= _MANY else 0.0)
 
     def _row(self, job: Job) -> StudyRow:
+        """Row of a job: variant, status, scores (NaN where missing) and time per stage, ms."""
         score, variant = collect_run(job), self.variants[job.method]
         state = read_state(job.state_file) or State(job.digest, score.status)
         values, scans = score.values, int(score.values.get("scans", 0))

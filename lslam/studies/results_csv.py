@@ -140,6 +140,7 @@ def read_study_csv(path: Path) -> list[StudyRow]:
 
 
 def _row(cells: dict[str, str]) -> StudyRow:
+    """Row from the cells of a line; raises ValueError for a cell of the wrong type."""
     # Earlier tables have no column `path`.
     values: dict[str, Any] = {name: _READ[kind](cells.get(name, "")) for name, kind in _PLAIN.items()}
     if values["metric"] not in get_args(StudyMetric):
@@ -198,6 +199,7 @@ def write_study_parquet(path: Path, rows: Sequence[StudyRow]) -> None:
 
 
 def _of_one_type(column: list[Value | None]) -> list[Value | None]:
+    """Values as floats where some are integers and some floats, as texts for any other mixture; None stays None."""
     kinds = {type(value) for value in column if value is not None}
     if len(kinds) < 2:
         return column

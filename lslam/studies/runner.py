@@ -115,6 +115,7 @@ def _choice(data: Sequence[str], worker: _Worker | None, workers: Sequence[_Work
 
 
 def _hire(pool: WorkerPool) -> _Worker:
+    """Start a worker process with a pipe to it."""
     context = get_context("spawn")
     ours, theirs = context.Pipe()
     process = context.Process(target=_child, args=(theirs,), name="lslam worker", daemon=False)
@@ -175,6 +176,7 @@ def _child(pipe: Connection) -> None:
 
 
 def _do(task: Task) -> None:
+    """Work on a task in this process; stdout and stderr go to its output file, which is removed when empty."""
     task.output.parent.mkdir(parents=True, exist_ok=True)
     with task.output.open("wb") as file:
         for number in (1, 2):
@@ -218,6 +220,7 @@ def _last_words(output: Path) -> str:
 
 
 def _end(processes: list[BaseProcess]) -> None:
+    """Terminate the processes, and kill those that live on after `_PATIENCE_S`."""
     for process in processes:
         process.terminate()
     for process in processes:

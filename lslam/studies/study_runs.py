@@ -198,10 +198,7 @@ def run_sweep(
     progress: StudyProgress | None = None,
     on_rows: Callable[[Sequence[StudyRow]], None] = lambda rows: None,
 ) -> list[StudyRow]:
-    """Make every run of the study, as `make_runs`.
-
-    Raises what `expand_study` and `make_runs` raise, and RunFailedError when all runs failed.
-    """
+    """Make all runs of a study. Raises as `expand_study` and `make_runs`, RunFailedError when all runs failed."""
     rows = make_runs(expand_study(sweep), sweep.output, engine, progress, on_rows)
     if rows and not any(row.is_usable for row in rows):
         raise RunFailedError(f"all {len(rows)} runs failed, the first one: {rows[0].reason}")

@@ -145,6 +145,7 @@ def find_subjects(
 
 
 def _find(word: str, data_root: Path | None) -> Subject:
+    """Recording or scenario called `word`; a recording precedes a scenario of the same name. Raises InputError for neither."""
     is_scenario = word in scenario_names()
     try:
         # Absolute, but links kept: `sequences/07` may be one, and its poses lie beside the link.

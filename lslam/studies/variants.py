@@ -149,6 +149,7 @@ def study_variants(study: StudyConfig, settings: Sequence[str] = ()) -> list[Var
 
 
 def _check_metric(study: StudyConfig, align: Sequence[str]) -> None:
+    """Raise UsageError when the study's metric needs an alignment that is not evaluated."""
     alignment = study.metric.removeprefix("ate_")
     if alignment != study.metric and alignment not in align:
         raise UsageError(

@@ -246,6 +246,7 @@ def _run(job: Job, is_persistent: bool) -> tuple[str, str]:
 
 
 def _open(job: Job) -> Sequence:
+    """Open the recording of a job; simulate it first where it is missing."""
     from lslam.pipeline.check import open_recording
     from lslam.studies.subjects import simulate_once
 

@@ -210,10 +210,7 @@ def rough_residuals(seconds: Floats, antenna: Floats, positions: Floats) -> Floa
 
 
 def agreeing_heights(off: Floats, sigmas: Floats) -> Bools:
-    """(F,) whether the height of each fix belongs to the level of the majority.
-
-    off : (F,) m, of fixes minus trajectory; sigmas : (F,) m
-    """
+    """(F,) whether the height of each fix belongs to the majority's level; off : (F,) m, of fixes minus trajectory."""
     order = np.argsort(off, kind="stable")
     values, reach = off[order], WITHIN * sigmas[order]
     counts = np.searchsorted(values, values + reach, side="right") - np.searchsorted(values, values - reach)

@@ -81,10 +81,7 @@ def marginals(factors: Any, values: Any, poses: Floats) -> Floats:
 
 
 def marginal_blocks(factors: Any, values: Any, keys: Iterable[int]) -> Floats:
-    """(K, 6, 6) covariances of the poses with these keys, in gtsam's order (rotation first) and body axes.
-
-    Raises GraphError when the graph is singular.
-    """
+    """(K, 6, 6) covariances of poses, gtsam's order (rotation first), body axes. Raises GraphError for a singular graph."""
     import gtsam
 
     needed = list(keys)

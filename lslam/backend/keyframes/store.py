@@ -181,10 +181,7 @@ class KeyframeStore(Stateful):
 
 
 class PartOfStore(KeyframeStore):
-    """Some of another store's keyframes, by their numbers there; their own begin at 0.
-
-    whole : they as the other store has them
-    """
+    """Some of another store's keyframes, numbered from 0; whole : the keyframes as the other store numbers them."""
 
     def __init__(self, store: KeyframeStore, numbers: Sequence[int]) -> None:
         super().__init__()

@@ -51,10 +51,7 @@ class PlaceMatch:
 
 
 class PlaceDescriptor(Protocol):
-    """The places seen so far, by keyframe number.
-
-    yaw_error : rad, by which the yaw of a match may be wrong
-    """
+    """The places seen so far, by keyframe number; yaw_error : rad, largest error of a match's yaw."""
 
     yaw_error: float
 

@@ -97,10 +97,7 @@ class LevelSubmap:
 
 
 def make_level_submap(points: Points, config: RegistrationConfig) -> LevelSubmap:
-    """Prepare the points (N, 3), m, of a submap in level axes, z up.
-
-    Voxels with too few points for a Gaussian give no source points.
-    """
+    """Prepare the points (N, 3), m, of a submap in level axes, z up. Voxels with few points give no source points."""
     fine = GaussianMap(min(config.voxel_size, LARGEST), reach=np.inf, capacity=CAPACITY)
     for first in range(0, len(points), CAPACITY // 4):
         fine.insert(points[first : first + CAPACITY // 4], np.eye(4))

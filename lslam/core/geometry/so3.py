@@ -109,10 +109,7 @@ def least_rotation(a: Floats, b: Floats) -> Floats:
 
 
 def level_frame(up: Floats) -> Floats:
-    """(3, 3) rotation that maps the unit vector `up` (3,) to z and keeps the heading of x.
-
-    The least rotation if x is nearly vertical. The identity for up = z.
-    """
+    """Rotation (3, 3) of unit vector `up` (3,) to z that keeps the heading of x, or the least one where x is nearly vertical."""
     if np.array_equal(up, (0.0, 0.0, 1.0)):
         return np.eye(3)
     ahead = np.array([1.0, 0.0, 0.0]) - up[0] * up

@@ -95,9 +95,7 @@ class Camera:
     load: Callable[[int], Image]
 
     def image(self, k: int) -> Image:
-        """Read image k, (height, width, 3) uint8. Raises InputError for an unreadable one, or a size other than the
-        calibration's.
-        """
+        """Read image k, (height, width, 3) uint8. Raises InputError if it is unreadable or its size is not the calibration's."""
         image = self.load(k)
         height, width = image.shape[:2]
         if (width, height) != self.lens.size:

@@ -12,10 +12,7 @@ from lslam.core.types.arrays import Bools, Floats, Longs
 
 @dataclass(frozen=True)
 class GnssStream:
-    """Fixes of one receiver.
-
-    stamps_ns : (M,) int64; lat_lon_alt : (M, 3) float64, deg, deg, m (WGS84); sigma : (M,) float64 one-sigma, m
-    """
+    """Fixes of a receiver: stamps (M,) int64, WGS84 (M, 3), deg, deg, m, and one sigma (M,), m."""
 
     stamps_ns: Longs
     lat_lon_alt: Floats

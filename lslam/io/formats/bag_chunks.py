@@ -74,10 +74,7 @@ class RangedFile:
         return slice(at, at + _AHEAD if self._expected[at : at + 1] == [number] else at)
 
     def _block(self, number: int, last: int) -> bytes:
-        """Block `number` of the object, from the cache.
-
-        If it must be fetched, the blocks up to `last` and the announced ones are fetched with it.
-        """
+        """Block `number` of the object; a fetch includes the blocks up to `last` and the announced ones."""
         if number not in self._blocks:
             due = self._due(number)
             wanted = np.array(sorted({*range(number, last + 1), *self._expected[due]} - self._blocks.keys()))

@@ -106,10 +106,7 @@ class Bag:
     """All files of one recording as one bag. Messages are read on demand, from any thread."""
 
     def __init__(self, path: Path, files: list[Path]) -> None:
-        """Open the files of a recording.
-
-        Raises InputError where none can be read, and for files of ROS 1 and of ROS 2 that hold the same topics.
-        """
+        """Open a recording's files. Raises InputError if none is readable, or files of ROS 1 and 2 hold the same topics."""
         self.path = path
         self.losses = left_out(path, files) + missing_parts(path, files)
         self.notes: list[str] = []
@@ -137,10 +134,7 @@ class Bag:
         return [t for t in self.topics if len(t) and t.encoding in _ENCODINGS and t.type.rsplit("/", 1)[-1] in names]
 
     def message(self, topic: BagTopic, k: int, limit: int | None = None) -> bytes:
-        """Serialised bytes of message `k` of `topic`, at least the first `limit` of them.
-
-        Raises InputError when it is damaged.
-        """
+        """First bytes of message `k` of `topic`, at least `limit` if it has them. Raises InputError for a damaged one."""
         recording, part, row = topic.place(k)
         data = recording.read(part, row, limit)
         return _decompress(recording, part, row, limit) if data[:4] == _ZSTD else data
@@ -221,10 +215,7 @@ def _copies(files: list[list[Topic]]) -> dict[int, int]:
 
 
 def _is_within(topics: list[Topic], others: list[Topic]) -> bool:
-    """Whether every message of a file is also in the others, by topic and time.
-
-    The comparison stops early if its time range is not within theirs.
-    """
+    """True when the other files hold every message of a file, by topic and time."""
 
     def has_all(stamps: Longs, others_ns: Longs) -> bool:
         is_around = len(stamps) > 0 and stamps[0] <= others_ns[0] and others_ns[-1] <= stamps[-1]

@@ -240,10 +240,7 @@ def _entry(path: Path, entries: dict[str, str], name: str, count: int) -> Floats
 
 
 def _rigid(R: Floats, t: Floats, path: Path, name: str) -> Floats:
-    """(4, 4) rigid transform.
-
-    The rotation is projected onto SO(3): with seven printed digits `R^T` is not exactly the inverse.
-    """
+    """(4, 4) rigid transform: seven printed digits give no exact rotation, so it is projected onto SO(3)."""
     if not so3.is_rotation(R, 1e-2):
         raise InputError(f"calibration {path}: {name} holds no rotation")
     return se3.normalise(se3.make(R, t))

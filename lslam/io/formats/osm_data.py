@@ -110,10 +110,7 @@ class OsmData:
             self.add_relation(Relation(number, own, tags))
 
     def draw_way(self, number: int, geometry: Iterable[Mapping[str, Any] | None]) -> None:
-        """Store the positions of a way whose nodes have no numbers (Overpass' `out geom`).
-
-        Points outside the requested box are None.
-        """
+        """Store positions of a way whose nodes have no numbers (Overpass' `out geom`); None outside the requested box."""
         places = [(float(p["lat"]), float(p["lon"])) if p and "lat" in p else None for p in geometry]
         self._outlines.setdefault(number, places)
 

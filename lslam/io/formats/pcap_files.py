@@ -81,10 +81,7 @@ class Datagrams:
 
 
 def read_datagrams(path: Path) -> Datagrams:
-    """The UDP datagrams of a capture, pcap or pcapng.
-
-    Raises InputError naming the file when it is unreadable, empty or no capture, UsageError in object storage.
-    """
+    """UDP datagrams of a pcap(ng). Raises InputError if unreadable, empty or no capture, UsageError in object storage."""
     if isinstance(path, RemotePath):
         raise UsageError(f"{path}: captures are read from a disk: copy it there")
     with input_errors(path, ValueError):

@@ -98,12 +98,7 @@ KITTI = parse_record("x y z intensity")
 
 @dataclass(frozen=True)
 class Recognition:
-    """Result of `recognise`.
-
-    record : None where none or several fit; fitting : all that fit
-
-    reason : why it is not KITTI's, empty where it is
-    """
+    """Result of `recognise`: `record`, None unless exactly one fits; `fitting`, all that fit; `reason` why it is not KITTI's."""
 
     record: PointRecord | None
     reason: str = ""

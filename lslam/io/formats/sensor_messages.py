@@ -121,10 +121,7 @@ def packet_topics(bag: Bag) -> list[BagTopic]:
 
 
 def read_packets(topic: BagTopic, data: bytes) -> tuple[Longs, NDArray[np.uint8], str]:
-    """Packets of a message: stamps (P,), ns, 0 if unknown; bytes (P, size); and the frame.
-
-    Raises InputError when it is cut off.
-    """
+    """Stamps (P,), ns, 0 if unknown, bytes (P, size) and frame of a message's packets; InputError when it is cut off."""
     is_ros1 = topic.encoding == "ros1"
     try:
         if topic.type.endswith(PACKET):
@@ -180,10 +177,7 @@ def is_packets(kind: str) -> bool:
 
 
 def decoding_advice(maker: str, where: str = "") -> str:
-    """Text for messages about packets that cannot be decoded, and what to do; it follows `holds`.
-
-    `where` is inserted after the maker.
-    """
+    """What to do about packets that cannot be decoded; the text follows `holds`, `where` comes after the maker."""
     whose = f"a {maker} LiDAR" if maker else "a LiDAR"
     driver = f"{maker}'s own driver" if maker else "the sensor's driver"
     return (

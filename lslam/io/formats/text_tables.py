@@ -89,10 +89,7 @@ class TextTable:
         return lost
 
     def check_widths(self, width: int, whose: str, is_least: bool = False) -> None:
-        """Raise InputError naming the first line with another number of cells than required.
-
-        If `is_least`, wider lines pass.
-        """
+        """Raise InputError naming the first line with fewer cells than required, or, unless `is_least`, with more."""
         for k, row in enumerate(self.rows):
             if len(row.cells) < width or (len(row.cells) > width and not is_least):
                 raise self.error(k, f"{len(row.cells)} columns where {whose} has {width}")

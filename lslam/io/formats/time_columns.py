@@ -40,10 +40,7 @@ _STAMPED, _TIMED, _ENDING = 0, 1, 2
 
 
 class RowTimes(NamedTuple):
-    """Times of the rows of a table.
-
-    stamps_ns : (N,); note : columns used, and other candidates, in words; columns : all of these columns
-    """
+    """Stamps (N,) of a table's rows, ns; note : columns used, and other candidates; columns : all of these."""
 
     stamps_ns: Longs
     note: str
@@ -223,10 +220,7 @@ def _with_fraction(table: TextTable, words: list[list[str]], k: int, free: list[
 
 
 def _by_place(table: TextTable, other_columns: Collection[int]) -> list[Units]:
-    """Time columns by position in a table without names.
-
-    They are a time, or seconds and nanoseconds, perhaps after an index or a text.
-    """
+    """Time columns of a table without names: a time, or seconds and nanoseconds, perhaps after an index or a text."""
     width = min([3, *other_columns, *(len(row.cells) for row in table.rows)]) if table.rows else 0
     numbers = [table.numbers(k) for k in range(width)]
     out: list[Units] = []

@@ -344,10 +344,7 @@ def _are_unit(q: Floats) -> bool:
 
 
 def _scalar_by_motion(positions: Floats, q: Floats) -> str:
-    """Place of w in a quaternion, `first` or `last`, judged by the motion; empty when unclear.
-
-    A vehicle moves along one fixed direction of its body.
-    """
+    """Place of w in quaternions, `first` or `last`: a vehicle moves along one body direction. Empty when unclear."""
     good = np.isfinite(q).all(axis=1) & np.isfinite(positions).all(axis=1)
     q, steps = q[good], np.diff(positions[good], axis=0)
     path_m = np.linalg.norm(steps, axis=1).sum()

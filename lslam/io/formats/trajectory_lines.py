@@ -169,10 +169,7 @@ def _stamps_of_kitti(path: Path, scans: Longs, times: Path | None) -> Longs | No
 
 
 def write_g2o(path: Path, poses: Floats, constraints: Sequence[Constraint]) -> None:
-    """Write poses (K, 4, 4), m, as vertices 0..K-1, the first one fixed, and constraints as edges.
-
-    Raises OutputError when the file cannot be written.
-    """
+    """Write poses (K, 4, 4), m, as vertices, the first fixed, and constraints as edges. Raises OutputError if it fails."""
     lines = [f"VERTEX_SE3:QUAT {k} {_pose_text(pose)}" for k, pose in enumerate(poses)]
     lines += ["FIX 0"] if len(poses) else []
     for c in constraints:

@@ -115,10 +115,7 @@ def _parse_frames(topic: BagTopic, counts: Counter[str], choice: str) -> list[st
 
 
 def read_cloud(bag: Bag, topic: BagTopic, k: int) -> tuple[PointCloud, int]:
-    """Points of message `k`, and the offset of their time base from the header's stamp, ns.
-
-    Raises InputError when it is damaged.
-    """
+    """Points of message `k`, offset of their time base from the header's stamp, ns. Raises InputError for a damaged one."""
     where = Path(f"{bag.path}, {topic.name}, message {k}")
     data = bag.message(topic, k)
     if not topic.type.endswith("CustomMsg"):
@@ -240,10 +237,7 @@ def _when(times: NDArray[Any]) -> tuple[float, float, float]:
 
 @dataclass
 class Links:
-    """Transforms between frames; /tf is read when /tf_static does not connect the two.
-
-    static : of /tf_static; uses_tf : whether a chain used /tf
-    """
+    """Transforms between frames, of /tf_static (`static`), else /tf too; uses_tf : whether a chain needed /tf."""
 
     bag: Bag
     voice: Voice

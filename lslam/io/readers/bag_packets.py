@@ -108,10 +108,7 @@ def _gather(bag: Bag, topics: list[BagTopic], positions: tuple[int, ...], voice:
 
 
 def _metadata(bag: Bag, topic: BagTopic) -> tuple[OusterSensor, str]:
-    """Metadata of an Ouster sensor, from a topic of its namespace or the only JSON file beside the bag, and their source.
-
-    Raises InputError without them.
-    """
+    """Metadata of an Ouster sensor, of a topic or the only JSON file beside the bag, and their source; else InputError."""
     named = [t for t in bag.of_type("String") if "metadata" in t.name.rsplit("/", 1)[-1]]
     own = [t for t in named if _namespace(t) == _namespace(topic)] or named
     if len(own) == 1 and (text := read_text(bag, own[0].name)) is not None:

@@ -106,10 +106,7 @@ GNSS = Companion("GNSS", "--gnss-topic", "NavSatFix", read_fixes, "--gnss and --
 
 
 def load_companion(bag: Bag, kind: Companion, choice: str | None, voice: Voice) -> Stream | None:
-    """Stream of topic `choice`, or of the only topic of its kind.
-
-    None, with a problem in `voice`, when there are several topics or no usable samples.
-    """
+    """Stream of topic `choice` or the only one of its kind; None, with a problem, for several or no usable samples."""
     topics = bag.of_type(*kind.type.split(" or "))
     if choice is not None:
         topics = [_find_topic(bag, topics, choice, kind.flag, f"{kind.type} messages")]

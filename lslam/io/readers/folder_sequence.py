@@ -99,10 +99,7 @@ class Folder:
     def begin(
         cls, path: Path, kind: str, why: str, overrides: SequenceInfo, scans: tuple[list[Path], list[str]], nothing: str
     ) -> Folder:
-        """Start opening a folder.
-
-        Raises InputError: with the text `nothing` if there are no scans, else about `sequence.toml` or the points.
-        """
+        """Open a folder. Raises InputError: `nothing` if there are no scans, else about `sequence.toml` or points."""
         info, has_toml = read_info(path, overrides)
         files, left_out = scans
         if not files:

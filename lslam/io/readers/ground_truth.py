@@ -57,10 +57,7 @@ class Voice:
 
 
 def find_ground_truth(folder: Path, info: SequenceInfo, voice: Voice) -> Path | None:
-    """The file that `sequence.toml` names, else the first of `USUAL_NAMES` in `folder`; None without one.
-
-    A missing named file is added to the problems.
-    """
+    """File named in `sequence.toml`, whose absence is a problem, else the first of `USUAL_NAMES` in `folder`, else None."""
     if info.ground_truth is not None:
         path = folder / info.ground_truth
         path = path.resolve() if isinstance(path, RemotePath) else Path(os.path.normpath(path))

@@ -24,10 +24,7 @@ KIND = "kitti-odometry"
 
 
 def locate(folder: Path) -> tuple[Path, str] | None:
-    """Sequence folder in or at `folder` and the reason why it is one, else None.
-
-    Raises InputError listing the sequences if there are several.
-    """
+    """Sequence folder in or at `folder`, and why it is one, or None. Raises InputError that lists several."""
     if (folder / "velodyne").is_dir():
         return folder, "it has velodyne/, as KITTI odometry sequences do"
     for sequences in (folder / "sequences", folder / "dataset" / "sequences"):

@@ -77,10 +77,7 @@ _UPWARDS = 4
 
 
 def locate(folder: Path) -> tuple[Path, str] | None:
-    """Drive in or at `folder` and the reason why it is one, else None.
-
-    Raises InputError listing the drives of a day with several.
-    """
+    """Drive in or at `folder`, and why it is one, or None. Raises InputError that lists several drives."""
     if (folder / "velodyne_points").is_dir():
         return folder, "it has velodyne_points/, as KITTI raw drives do"
     if (folder / "oxts").is_dir():
@@ -348,10 +345,7 @@ def start_on_earth(folder: Path, data_root: Path | None = None) -> tuple[Floats,
 
 
 def _drive_of(folder: Path, data_root: Path | None, missing: str, wish: str) -> tuple[Path, Path]:
-    """Raw drive of the sequence in `folder` and its calibration file.
-
-    Raises InputError that begins with `missing` and advises to run without `wish`.
-    """
+    """Raw drive of the sequence in `folder`, and calibration file. Raises InputError: `missing`, and to run without `wish`."""
     date, number, _ = DRIVES[sequence_number(folder.name)]
     roots = [Path(root).expanduser() for root in (data_root, os.environ.get("LSLAM_DATA")) if root]
     places = dict.fromkeys([*roots, folder, *list(folder.parents)[: 1 + _UPWARDS], Path.cwd()])

@@ -29,10 +29,7 @@ _PACKET_BYTES, _LOOKED_AT = 200, 20  # LiDAR packets are larger; so many tell wh
 
 @dataclass(kw_only=True)
 class PcapSequence(SequenceOnDisk):
-    """Recording in a capture.
-
-    revolutions : its scans
-    """
+    """Recording in a capture; revolutions : its scans."""
 
     revolutions: Revolutions
 
@@ -60,10 +57,7 @@ def locate(path: Path) -> tuple[Path, str] | None:
 
 
 def open_folder(path: Path, overrides: SequenceInfo, why: str) -> PcapSequence:
-    """Open the capture at `path`.
-
-    Raises InputError when it is unreadable, has no packets of a known sensor, or lacks the metadata they need.
-    """
+    """Open the capture at `path`. Raises InputError if unreadable, without packets of a known sensor or their metadata."""
     info, _ = read_info(path.parent, overrides)
     voice = Voice([f"format {KIND}: {why}", *compensation_note(info)], [])
     datagrams = read_datagrams(path)

@@ -333,10 +333,7 @@ def open_with_metadata(
 
 
 def _shift(times_ns: Longs, captured_ns: Longs, voice: Voice) -> int:
-    """Offset from the sensor's clock, which counts from power-up, to Unix time, ns.
-
-    The packet with the least delay determines it.
-    """
+    """Offset from the sensor's clock since power-up to Unix time, ns, by the packet with the least delay."""
     if times_ns[0] >= _UNIX_NS:
         return 0
     shift = int((captured_ns - times_ns).min())

@@ -208,10 +208,7 @@ class LabelledSequence(SequenceView):
         self._files = [folder / f"{scan.stem}.label" for scan in scans]
 
     def scan(self, index: int) -> Scan:
-        """Read scan `index` and its labels.
-
-        Missing or mismatched labels are reported in the scan's `fault`. Raises InputError as the sequence does.
-        """
+        """Scan `index` with its labels; `fault` tells of missing or mismatched ones. Raises InputError as the sequence."""
         scan = self.whole.scan(index)
         if scan.labels is not None or not len(scan):
             return scan

@@ -96,10 +96,7 @@ def _moving(sequence: Sequence, preprocess: PreprocessConfig) -> Iterator[ClockW
 
 
 def _judge(windows: list[ClockWindow], proposal: Proposal, sample: Scan) -> ClockChoice:
-    """Choose the clock under which the scans of the windows agree best, if it is clear.
-
-    Candidates are no times, the proposal and its reverse first, then others.
-    """
+    """Choose the clock, or no times, under which the scans of the windows agree best; none is chosen if that is unclear."""
     forward = proposal.clock
     backward = replace(forward, is_reversed=True)
     candidates: list[SweepClock | None] = [None, forward, backward]

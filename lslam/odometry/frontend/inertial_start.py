@@ -39,10 +39,7 @@ log = logging.getLogger("lslam")
 
 @dataclass
 class Inertial:
-    """The IMU's part in a run.
-
-    motion : None when it was refused from the start; problems : why it was, or could not do all of its work
-    """
+    """The IMU's part in a run: motion model, None if it was refused at the start, and problems."""
 
     motion: InertialMotion | None
     start: InertialStart | None = None

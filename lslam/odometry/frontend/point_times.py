@@ -79,10 +79,7 @@ def with_point_times(sequence: Sequence, preprocess: PreprocessConfig, is_stated
 def _by_agreement(
     sequence: Sequence, scans: list[Scan], nominal: SweepClock, preprocess: PreprocessConfig
 ) -> ClockChoice | None:
-    """The clock that the order of points proposes and the agreement of scans confirms, also for later parts.
-
-    None where nothing is proposed.
-    """
+    """Clock that the order of points proposes and the agreement of scans confirms, also for later parts; else None."""
     rows = getattr(sequence, "rows", None)
 
     def decide(first: int) -> ClockChoice:

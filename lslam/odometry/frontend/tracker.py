@@ -304,10 +304,7 @@ def _both(first: RegistrationResult, second: RegistrationResult) -> Registration
 
 
 def _matrix_norm(prior: Floats, pose: Floats) -> float:
-    """Error of the motion prior, (4, 4), against registration: the largest singular value of inv(prior) pose - I.
-
-    Girolimetto, equation 5.1.
-    """
+    """Error of the prior (4, 4): largest singular value of inv(prior) pose - I (Girolimetto, equation 5.1)."""
     return float(np.linalg.norm(se3.relative(prior, pose) - np.eye(4), 2))
 
 

@@ -168,10 +168,7 @@ class WindowTracker(Stateful):
         self._scans.append(entry)
 
     def decide(self, entry: ScanInput | None, result: ScanResult | None) -> list[TrackedScan]:
-        """The scans that are decided with the next one, None at the end: one, none, or all of a window.
-
-        result : of the present tracker
-        """
+        """Scans decided with the next one (None at the end) and its tracker's `result`: one, none, or all of a window."""
         tracks = self._tracker.decide(entry, result)
         if not self._scans:
             return self._to_world(tracks)

@@ -150,10 +150,7 @@ class InertialMotion(Stateful):
         return result.with_pose(pose, covariance)
 
     def _imu_motion(self, step: Increments) -> tuple[Floats, Floats]:
-        """Displacement (3,), m, of the IMU over `step` from the newest pose, and covariance (6, 6) of it and the rotation.
-
-        All in world axes.
-        """
+        """Displacement (3,), m, over `step` from the newest pose, and its covariance (6, 6) with the rotation, world axes."""
         R = (self._pose @ self.T_lidar_imu)[:3, :3]
         R_imu = R @ step.rotations[-1]
         moved, spread = self.estimate.displacement(step, R)

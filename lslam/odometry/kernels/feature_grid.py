@@ -30,10 +30,7 @@ NEARBY_RINGS = 2
 
 @kernel
 def build(points: Floats, rings: Rings, R: Floats, t: Floats, size: float) -> tuple[Floats, Rings, Ints, Longs, Ints]:
-    """Grid of points (N, 3), LiDAR frame, at pose R, t; cells of `size`, m. Points too far for a cell are left out.
-
-    The rings (N,) do not decrease.
-    """
+    """Grid of points (N, 3), LiDAR frame, at pose R, t, cells of `size`, m; rings (N,) ascend. Too far points are left out."""
     n = len(points)
     table = np.full(table_size(n), -1, np.int32)
     keys = np.empty(n, np.int64)

@@ -37,10 +37,7 @@ def check_beside(out: Path, source: Path, what: str) -> None:
 
 @contextmanager
 def stage(out: Path) -> Iterator[Path]:
-    """Temporary path that replaces `out`, a file or folder, when the block ends without an error.
-
-    Raises OutputError naming what cannot be written.
-    """
+    """Temporary path that replaces `out`, file or folder, after the block. Raises OutputError if it cannot be written."""
     folder = out.with_name(out.name + ".new")
     try:
         shutil.rmtree(folder, ignore_errors=True)

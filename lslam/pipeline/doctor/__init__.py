@@ -10,10 +10,7 @@ Facts = dict[str, Any]
 
 @dataclass(frozen=True)
 class Finding:
-    """One fault of a recording.
-
-    code : for scripts, for example `imu-accel-unit`; what : the fault with its numbers; way_out : what to do about it
-    """
+    """Fault of a recording: `code` for scripts, as `imu-accel-unit`; `what`, with its numbers; `way_out`, a remedy."""
 
     code: str
     what: str
