@@ -212,8 +212,6 @@ def align(
 ) -> GnssAlignment | None:
     """Fit the antenna's positions in the world to its fixes; None with fewer than `min_fixes` or half of them as inliers.
 
-    Parameters
-    ----------
     antenna : (F, 3) m, in the world of the trajectory; fixes : (F, 3) m, east, north, up; sigmas : (F, 3) m
     slack : (F,) m, one sigma of odometry's drift at each, in the inlier test
     up : (3,) unit, up in the world of the trajectory; up_sigma : rad

@@ -40,14 +40,9 @@ class Matches:
 def associate(estimate: Trajectory, truth: Trajectory, max_diff: float = 0.01, offset_ns: int = 0) -> Matches:
     """Match poses: by index when a file has no stamps, else by nearest stamp one to one, interpolating denser truth.
 
-    Parameters
-    ----------
     max_diff : s, largest difference of stamps in a pair
     offset_ns : added to the estimate's stamps first
-
-    Raises
-    ------
-    InputError when fewer than 3 poses match, with both time ranges, or when counts differ and there are no stamps.
+    Raises InputError when fewer than 3 poses match, with both time ranges, or when counts differ and there are no stamps.
     """
     for which, trajectory in (("estimate", estimate), ("ground truth", truth)):
         if len(trajectory) < LEAST_POSES:
@@ -176,10 +171,7 @@ def estimate_offset(estimate: Trajectory, truth: Trajectory) -> tuple[int, float
     Speed and rotation rate, which no frame changes, are correlated over all shifts in which at least 60 % of the shorter
     trajectory overlaps; the best one is refined between samples. When the stamps then agree up to one constant to 1 ms,
     that constant is the answer.
-
-    Raises
-    ------
-    InputError when a trajectory has no stamps or fewer than 3 poses, or when the motion does not determine the shift.
+    Raises InputError when a trajectory has no stamps or fewer than 3 poses, or when the motion does not determine the shift.
     """
     for which, t in (("estimate", estimate), ("ground truth", truth)):
         if not t.has_stamps or len(t) < LEAST_POSES:

@@ -301,8 +301,6 @@ def fit_law(
     Timings scatter in proportion to themselves, so the standard deviation of an observation is taken as proportional to the
     law over the root of its number of runs, and the fit is repeated with the weights of the law found before.
 
-    Parameters
-    ----------
     points : (N,) values of the parameter, for `product` (N, 2) of x and y; times : (N,) s, means over `runs` (N,) runs each
     level : of the confidence intervals, 0..1; scatter : (N,) s, of the runs behind each mean, as the law keeps it
     """

@@ -59,8 +59,6 @@ def reconcile(
 ) -> CommonFrame:
     """Bring matched poses (N, 4, 4) into one body frame.
 
-    Parameters
-    ----------
     frames : the frames the files state (estimate, ground truth); the motion outranks them where it is clear
     T_cam0_lidar : (4, 4) or None when unknown
     has_transform : the user stated the transform between the bodies: nothing is converted, a remaining difference is said

@@ -180,9 +180,6 @@ class Cleaner:
     little, and only what stands on it (`things`) is asked about.
 
     up : (3,) unit vector, up in the world of the scans
-
-    Attributes
-    ----------
     removed, seen : points taken out, of so many
     """
 

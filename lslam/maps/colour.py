@@ -80,18 +80,10 @@ class MapColourer:
 
     Points and their views lie in temporary files, mapped into memory: 100 bytes a point.
 
-    Parameters
-    ----------
     cloud : the map; spacing : of its points, m; reach : farthest from a camera, m
     spool : folder beside which the files are made; None: the system's temporary one
-
-    Attributes
-    ----------
     images : number of images so far; unseen : after `result`, points that none of them shows
-
-    Raises
-    ------
-    OutputError : the files cannot be written
+    Raises OutputError: the files cannot be written.
     """
 
     def __init__(self, cloud: Cloud, spacing: float, reach: float, spool: Path | None = None) -> None:

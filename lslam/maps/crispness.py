@@ -21,17 +21,10 @@ THRESHOLD = 0.2  # m
 def crispness(cloud: Cloud, radius: float = RADIUS, least: int = LEAST_POINTS, samples: int = SAMPLES) -> Crispness:
     """Score a map. A merged one may exceed memory, any other is read as a whole.
 
-    Parameters
-    ----------
     radius : of a neighbourhood, m; least : points it must have, at least 4
     samples : approximate number of points, evenly spread, whose neighbourhoods are evaluated
+    Raises UsageError: a radius or numbers that make no sense.
 
-    Raises
-    ------
-    UsageError : a radius or numbers that make no sense
-
-    Examples
-    --------
     >>> crispness(ArrayCloud.of([[0, 0, 0]])).entropy is None
     True
     """

@@ -61,17 +61,9 @@ class EveryPointMap:
 class PointCollector:
     """Collects the points of scans in a file; where points are averaged, `MapMerger` takes its place.
 
-    Parameters
-    ----------
     range_min, range_max, crop, spool, keep, attributes : as of `MapMerger`
-
-    Attributes
-    ----------
     scans : scans added; gated : points left out by range, crop or for being no measurement
-
-    Raises
-    ------
-    OutputError : the file cannot be written
+    Raises OutputError: the file cannot be written.
     """
 
     def __init__(

@@ -113,8 +113,6 @@ def top_view(cloud: Cloud | NDArray[Any], pixel: float = 0.2, longest: int = 160
 
     On a voxel map the number is the occupied height, so walls stand out from the ground.
 
-    Parameters
-    ----------
     cloud : points in the world frame, m, or an array (M, 3) of them; those that are not finite are ignored
     pixel : smallest edge of a pixel, m, a multiple of the map's voxel; a multiple of it when the long side would exceed
         `longest` pixels. Pixels hold whole columns of voxels: where some hold one and some two, the map is striped.

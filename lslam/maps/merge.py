@@ -30,9 +30,6 @@ class MergedMap:
     """Averaged points in the world frame, sorted by voxel (x, then y, then z); satisfies `Cloud`.
 
     Large ones lie in a temporary folder that goes when the map does, and are read in blocks; the arrays below read all.
-
-    Attributes
-    ----------
     points : (M, 3) float64, m; intensity : (M,) float32 mean of the voxel's points, or None; counts : (M,) int64 points
         averaged
     column_types : further columns, of the observation nearest to the sensor in each voxel, the earlier of two
@@ -96,26 +93,16 @@ class MapMerger:
     2**20 voxels (210 km at 0.2 m) from the first scan in every direction. Beyond `most` voxels in memory they go to a file
     sorted, and `result` adds up what belongs to one voxel: sums are exact, so the map is the same bytes either way.
 
-    Parameters
-    ----------
     voxel : edge of a voxel, m
     range_min, range_max : m from the sensor; points outside, and NaN, Inf and zero points, are left out
     crop : x_min, x_max, y_min, y_max, z_min, z_max of the world, m; points outside are left out
     spool : folder beside which large maps are kept meanwhile; None: the system's temporary one
     keep : folder in which they stay instead, so that `state` and `restore` work
     attributes : further columns of the map, as `map.attributes`; with some, every scan needs observations
-
-    Attributes
-    ----------
     scans : scans added; gated : points left out by range, crop or for being no measurement; outside : points too far
         from the first scan to have a voxel; refused : scans left out because their pose is not finite
+    Raises ConfigError: a voxel or range that makes no sense. OutputError: the spool cannot be written.
 
-    Raises
-    ------
-    ConfigError : a voxel or range that makes no sense. OutputError : the spool cannot be written
-
-    Examples
-    --------
     >>> merger = MapMerger(voxel=1.0, range_min=0.0)
     >>> merger.add(np.array([[0.25, 0.5, 0.5], [0.75, 0.5, 0.5], [5.0, 0.5, 0.5]], np.float32), np.eye(4))
     >>> merger.result().points.tolist()

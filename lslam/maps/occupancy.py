@@ -75,19 +75,12 @@ class Evidence:
 class OccupancyMapper:
     """Updates cells by rays; a scan updates a cell once, and a hit overrides a miss.
 
-    Parameters
-    ----------
     voxel : edge of a cell, m; range_min, range_max : m; farther points only free the cells up to there
     spool : folder beside which large maps are kept meanwhile; None: the system's temporary one; keep : one that stays
         instead, for `restore`
     origin : (3,) int64, cell in the middle of the key range; None: where the first scan is
+    Raises ConfigError: a cell or range that makes no sense. OutputError: the spool cannot be written.
 
-    Raises
-    ------
-    ConfigError : a cell or range that makes no sense. OutputError : the spool cannot be written
-
-    Examples
-    --------
     >>> mapper = OccupancyMapper(1.0, range_min=0.0)
     >>> mapper.add(np.array([[2.5, 0.5, 0.5]], np.float32), np.eye(4))
     >>> grid = mapper.result()

@@ -42,14 +42,9 @@ def rows_folder(beside: Path | None, folder: Path | None) -> tuple[Path, tempfil
 class SortedRuns:
     """Runs of rows (n, k), int64, each sorted by its first column, in files of a temporary folder.
 
-    Parameters
-    ----------
     beside : the folder the temporary one is made in; None: the system's
     folder : one that stays instead, and the runs in it with it, for `restore`
-
-    Raises
-    ------
-    OutputError : the folder or a file in it cannot be written
+    Raises OutputError: the folder or a file in it cannot be written.
     """
 
     def __init__(self, beside: Path | None = None, folder: Path | None = None) -> None:
@@ -169,8 +164,6 @@ class KeyedRows:
 
     Kernels find and enter them by a hash: `rows` (R, k), of which `used` are taken, and `slots` (S,) with the row of each.
 
-    Parameters
-    ----------
     columns : k; room : rows that there is room for at first
     beside, folder : as of `SortedRuns`
     """

@@ -128,8 +128,6 @@ WIDE_GRID = PreprocessConfig().source_voxel
 class FeatureMap(Stateful):
     """Less sharp edges and less planar points of past scans, in voxels around the sensor.
 
-    Parameters
-    ----------
     size : m, edge of a voxel of edges; plane_size : m, edge of the smallest voxel of planar points
     reach : m, voxels farther than this from the sensor are given back
     """

@@ -170,9 +170,7 @@ class Sightings:
 def step_residual(values: WindowValues, k: int, step: PreintegratedStep) -> tuple[Floats, Floats]:
     """Residual of state k + 1 relative to the prediction by `step` from state k, and its Jacobian.
 
-    Returns
-    -------
-    (15,) position, rotation, velocity, biases; (15, 42) by the shared part, state k and state k + 1
+    Returns (15,) position, rotation, velocity, biases; (15, 42) by the shared part, state k and state k + 1.
     """
     R, R_end = values.poses[k, :3, :3], values.poses[k + 1, :3, :3]
     t, force = step.seconds, values.accel_biases[k] - step.accel_bias
@@ -209,9 +207,7 @@ def sighting_residuals(
 
     anchors : (M, 4, 4) T_world_anchor of the planes; T_imu_lidar : (4, 4)
 
-    Returns
-    -------
-    (K, 3) m; (K, 3, 6) by position and rotation of the IMU; (K, 3, 3) by the plane
+    Returns (K, 3) m; (K, 3, 6) by position and rotation of the IMU; (K, 3, 3) by the plane.
     """
     T_world_lidar = values.poses @ T_imu_lidar
     expected, by_pose, by_plane = linearise_view(

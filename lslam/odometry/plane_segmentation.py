@@ -71,10 +71,8 @@ def linearise_view(cp: Floats, T_world_anchor: Floats, T_world_lidar: Floats) ->
 
     cp : (K, 3) in their anchors, m; T_world_anchor, T_world_lidar : (K, 4, 4)
 
-    Returns
-    -------
-    (K, 3) closest points in the LiDAR frames; (K, 3, 6) by t' = t + d[:3], R' = exp(d[3:]) R of the LiDAR, world axes;
-    (K, 3, 3) by `cp`
+    Returns (K, 3) closest points in the LiDAR frames; (K, 3, 6) by t' = t + d[:3], R' = exp(d[3:]) R of the LiDAR, world axes;
+    (K, 3, 3) by `cp`.
     """
     n, d = to_hesse(cp)
     Ra, Rl = T_world_anchor[:, :3, :3], T_world_lidar[:, :3, :3]

@@ -196,8 +196,6 @@ def _ground(building: Building) -> Any:
 def correct_buildings(matches: OsmMatches, poses: Floats, config: OsmConfig) -> CorrectedMap:
     """The map with the estimated displacements of the buildings of `matches`.
 
-    Parameters
-    ----------
     poses : (K, 3) x, y (m), yaw (rad) of all keyframes in the map frame
     config : by its `mode` nothing moves (`prior`), all buildings move together (`rigid`), or each by itself (other modes)
 

@@ -203,8 +203,6 @@ class Separation:
 def remove_overlaps(buildings: Sequence[Building], displacements: Floats, information: Floats) -> Separation:
     """The least displacements that separate overlapping buildings and keep party walls aligned.
 
-    Parameters
-    ----------
     displacements : (B, 3) x, y (m), yaw (rad) about each building's `middle`
     information : (B, 3, 3) of these, 1/m2 and 1/rad2, positive definite
 

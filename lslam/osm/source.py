@@ -89,8 +89,6 @@ class OsmBuffer:
     Del Tufo, section 3.1: the buildings within `fetch_radius` of the estimate are requested; when the estimate is more than
     `renew_radius` from that place, the next ones are. The caller never waits: a slow or unreachable server does not delay a run.
 
-    Parameters
-    ----------
     fetch : returns the Overpass reply for a box (`overpass.fetch_buildings`); called in a thread of the buffer
     origin : (3,) lat, lon (deg), height (m) of the local frame, x east and y north, of all positions here
     config : the radii

@@ -170,11 +170,8 @@ def _digest(values: Iterable[Any]) -> str:
 
 def may_go_on(folder: Path, identity: dict[str, str], config: Config) -> bool:
     """Whether there is a run to resume; False when nothing was begun in `folder`.
-
-    Raises
-    ------
-    RunFinishedError : the run is finished. RunFailedError, GateError : it diverged, or is degraded and `input.strict`
-    OutputExistsError : the folder has another run, or a damaged one
+    Raises RunFinishedError: the run is finished. RunFailedError, GateError: it diverged, or is degraded and `input.strict`
+    OutputExistsError: the folder has another run, or a damaged one.
     """
     if not (folder / MANIFEST).is_file():
         return False

@@ -117,14 +117,9 @@ MAP_PARTS = {"cards": "map_cards.html.j2", "map": "map_section.html.j2", "manife
 def write_report(path: Path, record: RunRecord, evaluation: Evaluation | None) -> None:
     """Write the HTML report of a run, atomically.
 
-    Parameters
-    ----------
     path : the file, usually `report.html` in the run folder
     evaluation : the run's score against ground truth; None without: the error parts then say so in one line
-
-    Raises
-    ------
-    OutputError : the file cannot be written
+    Raises OutputError: the file cannot be written.
     """
     write_text(path, render_report(record, evaluation))
 

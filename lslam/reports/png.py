@@ -187,8 +187,6 @@ def choose_crops(points: NDArray[Any], size: float = SIZE_M, most: int = MOST_CR
     Structure is counted in columns of 0.5 m whose points span more than 1 m of height; a square with less than a third of the
     best one's is not worth showing. Empty without any.
 
-    Parameters
-    ----------
     points : (M, 3) m; rows that are not finite are ignored
     """
     counts, low = _structure(points)

@@ -83,8 +83,6 @@ def trace(
 ) -> Scan:
     """Simulate one scan of `model`.
 
-    Parameters
-    ----------
     T_city_lidar : (4, 4) one pose for all rays (a motion-compensated scan, without times), or (columns, 4, 4) the pose at
      each firing (a distorted scan: points in the LiDAR frame of their own instant, times from 0 to `period` s)
     rng : source of noise and losses
@@ -94,9 +92,7 @@ def trace(
     returns : effects of real surfaces and beams; None for clean, sharp ones
     has_one_instant : whether all rays are fired at `stamp_ns`, whatever the poses; None: when there is one pose
 
-    Returns
-    -------
-    The measured points, with intensity 0..1 in steps of 0.01, rings, classes and, for distorted scans, times.
+    Returns The measured points, with intensity 0..1 in steps of 0.01, rings, classes and, for distorted scans, times.
     """
     # A stream of its own: without these effects every scan stays as it is.
     extra = rng.spawn(1)[0] if returns is not None else rng

@@ -300,15 +300,10 @@ def write_extracts(
 ) -> Extracts:
     """Write `map.osm`, `map_perturbed.osm` and `truth/map_perturbation.json` below `folder`, each atomically.
 
-    Parameters
-    ----------
     city : its x is east, its y north of `origin`
     origin : (3,) lat, lon (deg), height (m) of the city frame's x = y = 0
     faults : magnitudes of the errors of the perturbed copy, None for the defaults
-
-    Raises
-    ------
-    InputError : the city has no buildings; OutputError : `folder` cannot be written
+    Raises InputError: the city has no buildings; OutputError: `folder` cannot be written.
 
     The perturbation starts from the exact map after rounding to 1e-7 deg, so `perturb` of that map and the record
     reproduces the perturbed file byte for byte.

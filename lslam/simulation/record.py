@@ -235,11 +235,8 @@ def record(
     interrupted recording keeps its scans in `sequences/00.part`, and `resume` continues there with the same bytes. The
     sequence's `manifest.json` is written last, with the command line `command`. `has_labels` adds the class of every point;
     `on_image` the images of a camera, and is called after each.
-
-    Raises
-    ------
-    OutputExistsError : `out` is not empty and neither `overwrite` nor `resume` is set, or the unfinished drive is another one
-    OutputError : `out` cannot be written, or the disk is too small
+    Raises OutputExistsError: `out` is not empty and neither `overwrite` nor `resume` is set, or the unfinished drive is another
+    one OutputError: `out` cannot be written, or the disk is too small.
     """
     sequence, poses = out / "sequences" / NUMBER, out / "poses" / f"{NUMBER}.txt"
     check_target(out, overwrite, resume)

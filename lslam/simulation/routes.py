@@ -196,10 +196,7 @@ def read_way_points(path: Path, origin: NDArray[Any] | None = None) -> WayPoints
     TOML has `points = [[x, y], ...]` and `closed = true`; CSV has x, y and perhaps z per line, m; GeoJSON has one LineString
     or Polygon in degrees, x east and y north of `origin` (3,) lat, lon (deg), height (m), else of its first point. For a
     trajectory (KITTI, TUM, EuRoC) its horizontal shape is used, rotated to begin along +x.
-
-    Raises
-    ------
-    InputError naming the file and the position in it : missing, unreadable, unknown keys, fewer than three points
+    Raises InputError naming the file and the position in it : missing, unreadable, unknown keys, fewer than three points.
     """
     if not path.is_file():
         raise InputError(f"{path} does not exist: --path takes a trajectory or a file of way-points")

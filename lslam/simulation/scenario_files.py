@@ -272,11 +272,8 @@ def scenario_names() -> tuple[str, ...]:
 
 def find_scenario(name: str, settings: Iterable[str] = ()) -> Scenario:
     """Ready scenario `name`, or that of the file `name`.toml, with overrides `settings` ("speed=8", "world.relief=1").
-
-    Raises
-    ------
-    UsageError : no such scenario; ConfigError : a key that does not exist, or a value that does not fit
-    InputError : a file that is missing or no TOML
+    Raises UsageError: no such scenario; ConfigError: a key that does not exist, or a value that does not fit InputError: a file
+    that is missing or no TOML.
     """
     if name.endswith(".toml"):
         return parse_scenario(Path(name).stem, _read_toml(Path(name)), settings, name)

@@ -52,8 +52,6 @@ def build_town(
 ) -> City:
     """Build a town round the streets `main`. The same generator state gives the same town.
 
-    Parameters
-    ----------
     spacing : m between the side streets of a street, about; levels : 0 for no side streets, 1 for those of `main`, 2 for
         theirs as well
     """

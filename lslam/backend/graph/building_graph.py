@@ -183,8 +183,6 @@ def optimise_jointly(
 ) -> JointSolution:
     """Poses of keyframes and displacements of the buildings with `middles` (B, 2), m, in one graph.
 
-    Parameters
-    ----------
     graph : in the frame of the map; its loop closures and fixes are inliers; it has no planar priors
     map_prior : None is the baseline: the first building matched is anchored, no match is an outlier candidate
 

@@ -77,17 +77,12 @@ FORMATS = {
 def read_trajectory(path: str | Path, format: str | None = None, times: str | Path | None = None) -> Trajectory:  # noqa: A002
     """Read poses T_world_body.
 
-    Parameters
-    ----------
     path : the file, or a run folder, whose `trajectory.tum` is read
     format : one of FORMATS; detected from the first line when None
     times : file with one stamp in seconds per line, for KITTI poses; when None, `times.txt` beside the file is taken, or
         the one of the same sequence in KITTI's layout; without any, stamps count poses at 10 Hz and `has_stamps` is False
-
-    Raises
-    ------
-    InputError naming file and line: missing, empty, short lines, NaN, no rotation, stamps that do not increase.
-    UsageError for an unknown `format`.
+    Raises InputError naming file and line: missing, empty, short lines, NaN, no rotation, stamps that do not increase. UsageError
+    for an unknown `format`.
     """
     from lslam.io.formats.text_tables import read_table
 

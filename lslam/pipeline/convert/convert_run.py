@@ -56,16 +56,11 @@ def convert_run(
     Every scan has its pose as Odometry, with the run's covariance, and as the transform map -> lidar; those that were registered
     have their points, deskewed along the run's poses to the scan's stamp. The path so far comes `PATHS` times, the map first.
 
-    Parameters
-    ----------
     scans : the raw scans of the run, as `open_scans` gives them; None leaves the clouds out
     kind : `bag` (ROS 1), `mcap` or `sqlite` (ROS 2), as `convert_sequence` has them
     voxel : edge, m, of the voxels that keep one point of a scan each; 0 keeps all
-
-    Raises
-    ------
-    OutputExistsError, OutputError : as named. UsageError : `out` does not suit `kind`, or `voxel` is no length.
-    InputError : covariances or the map are damaged.
+    Raises OutputExistsError, OutputError: as named. UsageError: `out` does not suit `kind`, or `voxel` is no length. InputError:
+    covariances or the map are damaged.
     """
     check_output(kind, out, is_zstd, overwrite)
     check_beside(out, run.folder, "the run")

@@ -63,16 +63,11 @@ def convert_sequence(
 ) -> ScanCount:
     """Write `sequence` to `out`, whole or not at all.
 
-    Parameters
-    ----------
     kind : `bag` (ROS 1, one file), `mcap` or `sqlite` (ROS 2, a folder, or a file when `out` ends in .mcap or .db3), `kitti`
     is_zstd : compress mcap and sqlite
     trajectory : LiDAR poses along which scans with per-point times are deskewed on the way; None leaves them as they are
     lidars : of several, one of `LIDARS`: as merged, or in a bag each on a topic of its own, or all on one, told apart by frames
-
-    Raises
-    ------
-    OutputExistsError, OutputError : as named. UsageError : `out` or `lidars` does not suit. InputError : no scan can be read.
+    Raises OutputExistsError, OutputError: as named. UsageError: `out` or `lidars` does not suit. InputError: no scan can be read.
     """
     check_output(kind, out, is_zstd, overwrite)
     source = _Source(add_labels(sequence), trajectory, on_scan)

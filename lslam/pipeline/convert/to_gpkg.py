@@ -176,11 +176,8 @@ def convert_to_gpkg(
     `trajectory` is one line, `scans` a point each with number, stamp, UTC where stamps are Unix time, status and the standard
     deviation where it is largest, `buildings` and `new_walls` what the run found of OpenStreetMap. Coordinates are those of the
     run's map, or of `crs`. QGIS draws scans and buildings in a colour of their status.
-
-    Raises
-    ------
-    UsageError : the run is not georeferenced, or `out` has another suffix. OutputExistsError, OutputError : as named.
-    InputError : `folder` is no folder of a run, its files are damaged, or fudgeo is missing.
+    Raises UsageError: the run is not georeferenced, or `out` has another suffix. OutputExistsError, OutputError: as named.
+    InputError: `folder` is no folder of a run, its files are damaged, or fudgeo is missing.
     """
     if out.suffix != SUFFIX:
         raise UsageError(f"--out {out}: a GeoPackage is one file, its name ends in {SUFFIX}")

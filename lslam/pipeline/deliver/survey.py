@@ -113,11 +113,8 @@ def read_survey(folder: Path, crs: OutputCrs | None, check: Path | None = None, 
 
     crs : coordinates to deliver in, None for those of the run; check : file of points that the run did not use
     takes_any : also read a run that diverged or was interrupted
-
-    Raises
-    ------
-    RunFailedError : such a run is not to be delivered. UsageError : the run is not georeferenced, heights in `crs` are
-    unavailable, or a check point was used by the run. InputError : a file is missing or damaged.
+    Raises RunFailedError: such a run is not to be delivered. UsageError: the run is not georeferenced, heights in `crs` are
+    unavailable, or a check point was used by the run. InputError: a file is missing or damaged.
     """
     require_run(folder)
     manifest = read_json(folder / MANIFEST)
