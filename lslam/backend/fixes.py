@@ -148,7 +148,7 @@ def _kinds(sigmas: Floats) -> list[Bools]:
 def align_fixes(
     fixes: Fixes, up: Floats, up_sigma: float, min_fixes: int, faults: Faults
 ) -> tuple[GnssAlignment | None, Fixes, Faults]:
-    """The alignment, and the fixes with the heights of a deviating datum removed; east and north of these remain."""
+    """Alignment, None if too few fixes agree, the fixes, without heights of a deviating datum, and sentences on faults."""
 
     def fit(of: Fixes) -> GnssAlignment | None:
         return align(of.antenna, of.positions, of.sigmas, of.slack, up, up_sigma, min_fixes)
@@ -245,7 +245,7 @@ def _tilt_sigmas(a: Floats, up_sigma: float) -> Floats:
 
 
 def _consensus(a: Floats, fixes: Floats, sigmas: Floats) -> Floats | None:
-    """Heading and position by RANSAC over pairs of fixes (4 degrees of freedom)."""
+    """Pose (4, 4) by RANSAC over pairs of fixes (heading and position); None without a pair far enough apart."""
     rng = np.random.default_rng(0)
     reach = float(np.linalg.norm(a[:, :2] - np.median(a[:, :2], axis=0), axis=1).max())
     best: Floats | None = None

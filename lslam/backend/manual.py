@@ -169,7 +169,7 @@ def _is_comment(line: str, names: set[str]) -> bool:
 
 
 def _rows(path: Path, columns: Many[tuple[str, ...]]) -> Iterator[_Row]:
-    """The lines below the header, which has one column of each of the `columns`."""
+    """Lines below the header, which has one column of each of `columns`; raises InputError for another one."""
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:

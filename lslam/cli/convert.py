@@ -208,7 +208,7 @@ def _print(text: str, path: Path, kind: str, values: dict[str, Any], given: dict
 
 
 def _convert_to_gpkg(folder: Path, out: Path, given: dict[str, Any]) -> None:
-    """Convert a run to the layers of a GeoPackage."""
+    """Convert a run to the layers of a GeoPackage, and print their sizes."""
     from lslam.pipeline.convert.to_gpkg import convert_to_gpkg
 
     options.require_there(folder)
@@ -250,7 +250,7 @@ def _projection(source: Path, given: dict[str, Any]) -> Projection | None:
 
 
 def _read_trajectory(source: str, kind: str, given: dict[str, Any]) -> tuple[Trajectory, Calibration]:
-    """The trajectory of the file, or the ground truth of the sequence, and the calibration between the bodies."""
+    """Trajectory of the file, or ground truth of the sequence (InputError without), and calibration between bodies."""
     from lslam.core.errors import InputError
     from lslam.core.types.sequence import Calibration
     from lslam.io.formats.kitti_layout import read_cam0_lidar, read_transform

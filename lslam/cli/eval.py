@@ -111,7 +111,7 @@ def _flags(given: dict[str, Any]) -> dict[str, Any]:
 
 
 def _config(given: dict[str, Any], flags: dict[str, Any]) -> EvalConfig:
-    """Section `eval` of the configuration, overridden by the flags."""
+    """Section `eval` of the configuration, overridden by the flags. Raises UsageError for an invalid value."""
     from pydantic import ValidationError
 
     from lslam.core.config import load_config

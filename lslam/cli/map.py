@@ -32,7 +32,7 @@ _MOST = 20
 
 
 def compare_drives(target: Path, given: dict[str, Any]) -> None:
-    """Compare the drives and write what changed."""
+    """Compare the drives and write what changed. Raises UsageError for flags without use here."""
     folder, against = given["changes"], given["against"]
     if against is None:
         raise UsageError("--changes needs the run to compare with: --against RUN")
@@ -241,7 +241,7 @@ def _rebuild_tiles(run: EarlierRun, folder: Path, crs: OutputCrs | None, given: 
 
 
 def _settings(given: dict[str, Any]) -> list[str]:
-    """Flags over --set, as settings of the section `map`."""
+    """Flags over --set, as settings of the section `map`; raises UsageError for contradicting ones."""
     out: Path | None = given["out"]
     suffix = None if out is None else out.suffix.lower().lstrip(".")
     file_format = given["file_format"]

@@ -281,7 +281,7 @@ def typed_options() -> dict[str, str]:
 
 
 def output_of(given: dict[str, Any], name: str) -> OutputOptions:
-    """Output options of a study, from the options of `study_output`."""
+    """Output options of a study, from the options of `study_output`; raises UsageError for `--out` in object storage."""
     from lslam.studies.options import OutputOptions, folder_by_time
 
     out = given["out"] or folder_by_time(name)

@@ -238,7 +238,7 @@ def _print_plan(sequence: Sequence, config: Config, out: Path, as_json: bool) ->
 
 
 def run_again(folder: Path, recording: str | None, given: dict[str, Any]) -> None:
-    """Make the run in `folder` again, and print what differs; `recording` is where its scans are now."""
+    """Repeat the run in `folder` on `recording`, or where it was, and print what differs; UsageError for other options."""
     for name, option in options.typed_options().items():
         if name not in _FREE:
             raise UsageError(f"{option} is not for --again, which takes all of that from the run: leave it out")

@@ -70,7 +70,7 @@ def command(
 
 
 def record(run: Path, path: Path, overwrite: bool) -> None:
-    """Write the recording."""
+    """Write the recording. Raises OutputError when it cannot be written."""
     from lslam.core.errors import OutputError
     from lslam.pipeline.run_folder import require_new, require_run
     from lslam.reports.figures import require_rerun, write_recording

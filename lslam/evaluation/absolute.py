@@ -67,7 +67,7 @@ def absolute_error(estimate: Floats, truth: Floats, alignment: str, has_rotation
 
 
 def align(estimate: Floats, truth: Floats, alignment: str) -> tuple[Floats, float, str]:
-    """Alignment as transform (4, 4) and scale, and a note that is not empty when the alignment is not determined."""
+    """Alignment as transform (4, 4) and scale, and a note if it is not determined; UsageError for an unknown name."""
     if alignment not in ALIGNMENTS:
         raise UsageError(f"no alignment {alignment!r}; {nearest(alignment, ALIGNMENTS)}")
     p, q = estimate[:, :3, 3], truth[:, :3, 3]

@@ -200,7 +200,7 @@ def estimate_offset(estimate: Trajectory, truth: Trajectory) -> tuple[int, float
 
 
 def _peaks(scores: Floats, lags: Longs) -> list[int]:
-    """Indices of the at most 20 best scores that are not poor and not neighbours of a better one."""
+    """Indices of at most 20 best scores, best first, that are not poor and not within `2 WINDOW_POSES` of a better one."""
     chosen: list[int] = []
     for k in np.argsort(-scores, kind="stable")[:2000].tolist():
         if scores[k] < LEAST_SCORE or len(chosen) == 20:

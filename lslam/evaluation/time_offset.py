@@ -85,7 +85,7 @@ def _linearise(
     turns: bool,
     blocks: NDArray[np.int_],
 ) -> tuple[float, float, float] | None:
-    """Change of the offset, ns, its sigma, and the coherence, by the truth's motions at `stamps`, before and after."""
+    """Offset's change, ns, sigma, and coherence, by the truth's motion at `stamps`; None with too little motion or overlap."""
     inside = _covers(truth.stamps_ns, stamps - reach) & _covers(truth.stamps_ns, stamps + reach)
     use = inside[count:] & inside[:-count] & is_whole
     many = len(np.unique(blocks[use]))

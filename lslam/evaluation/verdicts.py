@@ -85,9 +85,7 @@ def judge_product(finding: ExpectedFinding, law: Law | None, result: CurveResult
 
 
 def _law(finding: ExpectedFinding, law: Law | None) -> Judged:
-    """Verdict on a law: confirmed if it explains enough and no other law does better; refuted if another law explains
-    enough, or if it is off by more than the scatter over seeds.
-    """
+    """Verdict on a law: confirmed if it explains enough and best; refuted if another does, or off by more than the scatter."""
     if law is None:
         return "undecided", f"no law is fitted to fewer than {FEWEST} values"
     least = finding.values[0] if finding.values else R2

@@ -220,7 +220,7 @@ def _changed_ns(info: dict[str, Any]) -> int:
 
 @contextmanager
 def _asking(path: RemotePath, what: str) -> Iterator[tuple[Any, str]]:
-    """Context with a path's file system and its name there. Exceptions become StorageError (`path` cannot be `what`)."""
+    """Context with a path's file system and its name there; storage's exceptions become errors, `path` cannot be `what`."""
     scheme = str(path).partition("://")[0]
     try:
         from fsspec.core import url_to_fs

@@ -43,7 +43,7 @@ class EveryPointMap:
         return self._count
 
     def blocks(self) -> Iterator[CloudBlock]:
-        """The points, `BLOCK` at a time."""
+        """The points, `BLOCK` at a time. Raises OutputError when the file cannot be read back."""
         for start in checking(range(0, self._count, BLOCK)):
             some = min(BLOCK, self._count - start)
             try:

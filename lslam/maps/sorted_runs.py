@@ -132,7 +132,7 @@ class StoredRows:
         self._count += len(rows)
 
     def read(self, begin: int, end: int) -> Rows:
-        """Rows from `begin` to before `end`."""
+        """Rows from `begin` to before `end`. Raises OutputError when the file cannot be read back."""
         try:
             flat = np.fromfile(
                 self._path, np.int64, max(end - begin, 0) * self.columns, offset=8 * self.columns * begin

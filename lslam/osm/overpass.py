@@ -265,7 +265,7 @@ def _check_status(reply: Any, server: str) -> None:
 
 
 def _read(reply: Any, server: str, timeout: float, is_late: threading.Event) -> bytes:
-    """The body, read in parts, so that its length and the timeout are checked in between."""
+    """Body in parts, whose length and time are checked (InputError); raises _TryAgainError for a broken connection."""
     import urllib3
 
     body = io.BytesIO()  # `getvalue` makes no copy

@@ -195,7 +195,7 @@ class OsmBuffer:
             circle.reply.write(stream, requested)
 
     def _load(self, folder: Path | None) -> None:
-        """Remember `folder` for later replies, and read those that an earlier run wrote there."""
+        """Remember `folder` for later replies, and read an earlier run's there; InputError for a damaged one."""
         self._folder = folder
         for path in [] if folder is None else sorted(folder.glob("*.json")):
             try:
@@ -267,7 +267,7 @@ class OsmServer(OsmBuffer):
             self.ask(np.zeros(2), self._config.fetch_radius * 2.0**doubled)
 
     def extract(self, origin: Floats) -> BuildingExtract:
-        """The buildings received, in the local frame at `origin` (3,), after a wait for the first reply and a short one more."""
+        """Buildings received, frame at `origin` (3,), after a wait for the first reply and a short one more; else InputError."""
         self.wait(FIRST_REPLY_S, requests=1)
         self.wait(LATER_REPLY_S)
         self.close()

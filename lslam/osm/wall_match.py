@@ -153,7 +153,7 @@ class _WallSearch:
         self.target = np.ascontiguousarray(target[self.numbers])
 
     def best(self) -> WallMatch | None:
-        """The refined pose of best fitness, from the prior and from the poses that corners propose."""
+        """Fittest pose, refined from the prior and from poses that corners propose; None if none covers enough."""
         if not len(self.source) or not len(self.target):
             return None
         gates = FINE_GATES if self.by_coverage else GATES

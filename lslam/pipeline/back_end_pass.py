@@ -276,7 +276,7 @@ def read_points(job: PreparedRun, results: list[ScanResult], nodes: Longs) -> Sw
 
 
 def _poser(config: Config, results: list[ScanResult], count: int) -> Callable[[Scan], tuple[Floats, Floats] | None]:
-    """Function of a scan: `count` of its points (N, 3) in the world, and s from the first registered scan (N,)."""
+    """Function of a scan: `count` points (N, 3), world, and s since the first scan (N,); None if it has no pose."""
     box = config.map.ego_box or config.preprocess.ego_box
     course, by_index = course_of(results), {result.index: result for result in results}
 

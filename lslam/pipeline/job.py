@@ -82,7 +82,7 @@ class PreparedRun:
 def prepare(
     sequence: Sequence | str | Path, config: Config, truth: Trajectory | None, command: str, watch: Watch
 ) -> PreparedRun:
-    """Check the configuration, open all inputs that it needs (fixes, IMU, wheels, poses, map), and choose the scans."""
+    """Check the configuration, open its inputs (fixes, IMU, wheels, poses, map), choose scans; InputError, UsageError."""
     check_config(config)
     if isinstance(sequence, (str, Path)):
         sequence = open_sequence(sequence)

@@ -86,7 +86,7 @@ def localise_poses(job: PreparedRun, record: RunRecord) -> None:
 def _follow(
     job: PreparedRun, results: list[ScanResult], prior_map: PriorMap, search: PlaceFinder
 ) -> tuple[list[MapFix], dict[str, Any]]:
-    """Register every scan on the map, from a start that is searched first; poses are still in level axes."""
+    """Register every scan on the map from a start that is searched; level axes. InterruptedRunError when stopped."""
     sequence, config, watch, checkpoints = job.sequence, job.config, job.watch, job.checkpoints_of("localise")
     earlier = None if checkpoints is None else checkpoints.latest()
     poses = np.stack([r.T_world_lidar for r in results])
@@ -233,7 +233,7 @@ def _at_first_scan(
 
 
 def _deliver(record: RunRecord, prior_map: PriorMap, fixes: list[MapFix], config: Config) -> None:
-    """Put the trajectory in the map's frame into the record. Registered scans keep their poses; odometry is bent between them."""
+    """Put the trajectory into the record, map frame, odometry bent between registered scans; RunFailedError without any."""
     T = prior_map.T_map_level
     results = record.results[: len(fixes)]
     into_map = [

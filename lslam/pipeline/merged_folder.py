@@ -191,7 +191,7 @@ def _rows(
 def _ate(
     before: Trajectory, after: Trajectory, recording: Recording | None, config: Config
 ) -> tuple[float, float] | None:
-    """ATE, se3, m, of a session alone and merged; None without ground truth."""
+    """ATE, se3, m, of a session alone and merged; None without ground truth, or if one cannot be evaluated."""
     if recording is None or recording.ground_truth is None:
         return None
     errors = []
@@ -216,7 +216,7 @@ def _line(row: SessionRow) -> str:
 
 
 def _georeference(merge: Merge) -> Georeference | None:
-    """Georeference of the common world, by the first session that has one."""
+    """Georeference of the common world, by the first session that has one; None without."""
     for n, run in enumerate(merge.runs):
         if run.georeference is not None:
             first = merge.sessions[n].keyframes[0].T_world_lidar

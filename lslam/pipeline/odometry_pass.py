@@ -159,7 +159,7 @@ def _stationary(config: Config) -> StationaryDetector | None:
 
 
 def _chain(inertial: Inertial, store: KeyframeStore, config: Config) -> InertialChain | None:
-    """IMU factors between keyframes, if the graph is to contain them."""
+    """IMU factors between keyframes; None if the graph is not to contain them, or the IMU was refused."""
     motion = inertial.motion
     if not isinstance(motion, SmootherMotion) or motion.refusal or not config.lio_sam.graph_imu:
         return None

@@ -214,7 +214,7 @@ def uncertainty_figures(record: RunRecord) -> list[Figure]:
 
 
 def first_available(evaluation: Evaluation | None) -> AbsoluteError | None:
-    """Alignment for drawing the trajectory: se3 when there is one."""
+    """Alignment for drawing the trajectory: se3 where available, else the next one; None without any."""
     if evaluation is None:
         return None
     for name in (*ALIGNMENTS, *evaluation.ate):
@@ -310,7 +310,7 @@ def _scale(totals: Floats, usual: float) -> float:
 
 
 def _bins(index: Floats, ms: Floats) -> tuple[Floats, Floats, Floats | None, str]:
-    """Edges (B+1,), mean per stage (B, S) and, when a bin holds several scans, the longest total of each bin."""
+    """Bin edges (B+1,), means per stage (B, S), largest totals or None if bins are single scans, and a remark on that."""
     if len(ms) <= svg.BINS:
         step = float(np.median(np.diff(index))) if len(index) > 1 else 1.0
         return np.append(index, index[-1] + max(step, 1e-9)), ms, None, ""

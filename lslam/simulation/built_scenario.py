@@ -175,7 +175,7 @@ def _check_radius(scenario: Scenario, line: RouteCurve) -> None:
 def _move(
     scenario: Scenario, route: Route, terrain: Terrain, count: int | None, standing: int, rng: np.random.Generator
 ) -> tuple[CarrierPath, int]:
-    """The path, and the number of scans: `count`, or one lap, or all that fit on an open line."""
+    """Path and number of scans: `count`, one lap, or all on an open line; UsageError if `count` does not fit."""
     line, rate = route.line, scenario.rate_hz
     distance = line.length
     if line.closed:

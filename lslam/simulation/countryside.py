@@ -289,7 +289,7 @@ def build_carpark(
 
 
 def _add_bumps(site: StreetSite, low: Floats, high: Floats, roughness: float) -> None:
-    """Add ground without holes, with random bumps."""
+    """Add ground without holes, with random bumps. Raises UsageError where it would be too large."""
     x, y = (_grid_lines(float(low[k]), float(high[k])) for k in (0, 1))
     if len(x) * len(y) > MOST_BUMPS:
         raise UsageError(

@@ -91,7 +91,7 @@ def speed_profile(scenario: Scenario) -> SpeedProfile:
 
 
 def own_route(scenario: Scenario, rng: np.random.Generator, scans: int | None = None) -> Route:
-    """Scenario's own street and path, scaled to its length; an out-and-back is made long enough for `scans` in motion."""
+    """Scenario's street and path, scaled, an out-and-back long enough for `scans`; UsageError if a closed one climbs."""
     path = scenario.path
     if path.shape == "block":
         return _block(rng)

@@ -125,7 +125,7 @@ class SimulatedDrive(Scans):
         return self._motion.poses(self.stamps_ns / 1e9)
 
     def _beside(self, mount: LidarMount, number: int) -> SimulatedDrive:
-        """The same drive recorded by another LiDAR, with its own noise and without the roof."""
+        """The drive by another LiDAR, with its own noise, without the roof; UsageError if no sweep of it is whole."""
         other, T, late_ns = copy.copy(self), mount.T_lidar_other, round(1e6 * mount.offset_ms)
         other.name, other.path = f"{self.name}-{mount.name}", Path(f"{self.name}-{mount.name}")
         other.lidar = self.lidar if mount.lidar is None else _with_ring_errors(find_lidar(mount.lidar), self.scenario)
@@ -153,7 +153,7 @@ class SimulatedDrive(Scans):
         return other
 
     def scan(self, index: int) -> Scan:
-        """Trace scan `index`, 0 <= index < len."""
+        """Trace scan `index`; raises IndexError outside 0 <= index < len."""
         if not 0 <= index < len(self):
             raise IndexError(f"scan {index} of {len(self)}")
         start, period = self.stamps_ns[index] / 1e9, 1 / self.rate_hz

@@ -217,7 +217,7 @@ def _pilots(job: Job, recording: _PilotRecording) -> list[_Pilot]:
 
 
 def _run(pilots: Sequence[_Pilot], folder: Path, progress: StudyProgress) -> tuple[list[Job], list[float]]:
-    """Seconds of each run, made in one process; the first one includes loading."""
+    """The jobs and seconds of each, in one process; the first includes loading. Raises RunFailedError without a result."""
     jobs = [replace(p.job, folder=folder / f"{k}-{p.scans}") for k, p in enumerate(pilots)]
     Local(title="pilot runs").run(jobs, progress, lambda job: None)
     seconds = []

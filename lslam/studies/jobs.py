@@ -281,7 +281,7 @@ def make_runs(
 
 
 def _check_folders(jobs: Sequence[Job], output: OutputOptions) -> None:
-    """Raise OutputExistsError if a run's own folder exists and is not of this study."""
+    """Raise OutputExistsError if a run's own folder exists, unless `overwrite`, or `resume` and this study made it."""
     for job in jobs:
         may_replace = output.overwrite or (output.resume and job.state_file.is_file())
         if output.out not in job.folder.parents and job.folder.exists() and not may_replace:

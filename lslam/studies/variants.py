@@ -110,7 +110,7 @@ def find_variants(
 
 
 def _meaning(name: str) -> tuple[str, str]:
-    """Label and setting of a name."""
+    """Label and setting of a method's or preset's name; raises UsageError for an unknown one."""
     if name in known_methods():
         return name, f"odometry.method={json.dumps(name)}"
     presets = known_presets()

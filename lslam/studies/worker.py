@@ -200,7 +200,7 @@ def _waited_s() -> float:
 
 
 def _run(job: Job, is_persistent: bool) -> tuple[str, str]:
-    """Status and reason of a run that came to its end."""
+    """Status and reason of a run that came to its end; raises InputError where the job was refused."""
     from lslam.pipeline.run import run
     from lslam.pipeline.watch import RunOutcome, watch_run
 

@@ -101,7 +101,7 @@ class KeyframeStore(Stateful):
         return self._load(number)[1]
 
     def _load(self, number: int) -> tuple[Points, Labels | None]:
-        """Points and labels of keyframe `number`, from the cache or its file; raises InputError for a damaged one."""
+        """Points and labels (None without) of keyframe `number`, from the cache or file; raises InputError if damaged."""
         file = self._files[number]
         with self._lock:
             if file in self._recent:
@@ -170,7 +170,7 @@ class KeyframeStore(Stateful):
         return self.folder / f"{file:06d}.npz"
 
     def _keep(self, file: int, cloud: Points, labels: Labels | None) -> tuple[Points, Labels | None]:
-        """Put a cloud, now read-only, into the cache, which drops the least recently used ones."""
+        """Put a cloud, now read-only, into the cache, which drops the least recently used ones; returns cloud and labels."""
         cloud.flags.writeable = False
         with self._lock:
             self._recent[file] = cloud, labels

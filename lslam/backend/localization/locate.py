@@ -176,7 +176,7 @@ class PlaceFinder:
         return move_points(points, se3.make(self._R_level @ self._poses[b, :3, :3], np.zeros(3)))
 
     def _region(self, b: int, prior: StartPrior | None) -> Region | None:
-        """Where keyframe `b` may be by the prior of the first scan and odometry."""
+        """Where keyframe `b` may be by the prior of the first scan and odometry; None without a prior."""
         if prior is None:
             return None
         step = self._R_level @ (self._poses[b, :3, 3] - self._poses[0, :3, 3])

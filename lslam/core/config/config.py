@@ -155,7 +155,7 @@ def _over_preset(tree: Tree) -> Tree:
 
 
 def _whole(name: str, above: tuple[str, ...] = ()) -> Tree:
-    """A preset merged over the one that it names as its `base`; above : presets that led to it, to detect cycles."""
+    """Preset merged over its `base`; above : presets that led to it. Raises ConfigError for a cycle."""
     if name in above:
         raise ConfigError(f"presets {', '.join(above)}: one cannot stand on itself")
     tree = read_preset(name)

@@ -183,7 +183,7 @@ class ChunkFile:
         ]
 
     def _decompress(self, chunk: Chunk, least: int) -> bytes:
-        """Decompressed records of a chunk, at least the first `least` bytes of them."""
+        """Decompressed records of a chunk, at least the first `least` bytes. Raises InputError for a damaged one."""
         kept, records = self._kept
         if kept == chunk.position and len(records) >= least:
             return records

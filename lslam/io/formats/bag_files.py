@@ -282,7 +282,7 @@ def typestore(encoding: str) -> Any:
 
 
 def _decompress(recording: Recording, topic: Topic, k: int, limit: int | None) -> bytes:
-    """Decompress a message that was compressed on its own; its beginning lies in the first block."""
+    """Decompress a message compressed on its own, which begins in the first block; raises InputError if damaged."""
     packed = recording.read(topic, k, None if limit is None else _ZSTD_BLOCK)
     try:
         data = unpack("zstd", iter([packed]), LARGEST + 1 if limit is None else limit)
@@ -318,7 +318,7 @@ def unpack_file(path: Path) -> Iterator[tuple[Path, str]]:
 
 
 def _kind(path: Path) -> str:
-    """Compression of a file by its first bytes. A name that contradicts them is refused."""
+    """Compression of a file by its first bytes. Raises InputError where its name contradicts them."""
     if isinstance(path, RemotePath):
         return packing_of(path)
     with input_errors(path), path.open("rb") as stream:

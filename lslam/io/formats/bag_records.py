@@ -78,7 +78,7 @@ class ChunkedBag(ABC):
                 topic.stamps_ns, topic.where = rows[:, 0].copy(), rows[:, 1:].copy()
 
     def read(self, topic: Topic, k: int, limit: int | None = None) -> bytes:
-        """Bytes of message `k` of `topic`; with `limit`, at least its first `limit` bytes."""
+        """Bytes of message `k` of `topic`, or at least the first `limit`; raises InputError when damaged or cut off."""
         number, offset = (int(v) for v in topic.where[k])
         chunk, is_head = None if number == IN_FILE else self._chunks[number], limit is not None
         try:

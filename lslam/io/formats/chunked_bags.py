@@ -175,7 +175,7 @@ class SqliteBag:
     """One `.db3` file: `topics`, and `loss`, a sentence when it was cut off."""
 
     def __init__(self, path: Path, copy: Path | None = None) -> None:
-        """Open `path`, or its decompressed copy if there is one."""
+        """Open `path` or its decompressed copy. Raises InputError when damaged, UsageError in object storage."""
         if isinstance(path, RemotePath):
             raise UsageError(
                 f"{path}: SQLite cannot be read in place from storage; *.mcap and *.bag are: `lslam convert` makes an MCAP file "
@@ -209,7 +209,7 @@ class SqliteBag:
         """Do nothing: a file on a disk needs no prefetching."""
 
     def read(self, topic: Topic, k: int, limit: int | None = None) -> bytes:
-        """Bytes of message `k` of `topic`; with `limit`, at least its first `limit` bytes."""
+        """Bytes of message `k` of `topic`, or at least the first `limit`; raises InputError when damaged."""
         row = int(topic.where[k, 0])
         try:
             with self._lock, self._db.blobopen("messages", "data", row, readonly=True) as blob:

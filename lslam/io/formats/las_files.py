@@ -99,7 +99,7 @@ def check_las(stream: BinaryIO) -> tuple[int, int]:
 
 
 def _laszip(stream: BinaryIO, begin: int, vlrs: int, record: int) -> tuple[lazrs.LazVlr, int]:
-    """Compression scheme of the points, and the number of layers of a chunk; 0 where it has none."""
+    """Compression scheme of points, and layers of a chunk (0 without); raises ValueError if the file does not state it."""
     import lazrs
 
     position = begin

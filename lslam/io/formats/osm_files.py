@@ -125,7 +125,7 @@ def _read_xml(path: Path, is_wide: bool) -> OsmData:
 
 
 def _parsed_xml(path: Path, stream: IO[Any]) -> OsmData:
-    """Iterate over the elements of an XML file, freeing each after use: the extract of a town is large."""
+    """Iterate over an XML file's elements, each freed after use, as files are large; InputError unless it is OSM's."""
     from defusedxml.ElementTree import iterparse
 
     data, root = OsmData(), None
@@ -253,7 +253,7 @@ def _place(position: Any) -> Place:
 
 
 def _areas(tree: Any, properties: Any = None, name: Any = None) -> Iterator[Area]:
-    """All areas of a GeoJSON tree: (kind, number) or None, tags, and polygons as lists of rings."""
+    """Areas of a GeoJSON tree: (kind, number) or None, tags, polygons as lists of rings; ValueError for a malformed one."""
     kind = str(tree.get("type")) if isinstance(tree, dict) else ""
     if kind in _PARTS:
         parts = tree.get(_PARTS[kind]) or []

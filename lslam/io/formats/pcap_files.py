@@ -93,7 +93,7 @@ def read_datagrams(path: Path) -> Datagrams:
 
 
 def _frames(path: Path, data: memoryview) -> tuple[Longs, str]:
-    """(N, 4) begin, captured bytes, stamp (ns) and link type of each frame; and a sentence about data lost at the end."""
+    """(N, 4) begin, captured bytes, stamp (ns), link type of frames, and data lost at the end; InputError for no capture."""
     magic = bytes(data[:4])
     if magic in _PCAP:
         walk = _walk_pcap(data, *_PCAP[magic])

@@ -280,7 +280,7 @@ def _first(names: Mapping[str, str], plain_names: tuple[str, ...]) -> str | None
 def _find_rings(
     points: NDArray[np.float32], candidates: Mapping[str, NDArray[Any]]
 ) -> tuple[str | None, NDArray[np.uint16] | None]:
-    """Name and values of the first candidate field that can be rings; unmeasured points are not considered."""
+    """Name and uint16 values of the first field that can be rings, NO_RING where it is none; None and None without one."""
     for name, values in candidates.items():
         if np.can_cast(values.dtype, np.uint16):
             rings = values.astype(np.uint16)

@@ -151,7 +151,7 @@ def read_array(path: Path) -> NDArray[Any]:
 
 
 def _npy_columns(path: Path, record: PointRecord | None) -> Mapping[str, NDArray[Any]]:
-    """Columns by name of a NumPy file, named by `record`, by its own fields, or by their values."""
+    """Columns by name of a NumPy file, named by `record`, its fields or values; InputError if numbers of columns differ."""
     table = read_array(path)
     if table.dtype.names:
         return _of_structure(table)
@@ -173,7 +173,7 @@ def _of_structure(table: NDArray[Any]) -> dict[str, NDArray[Any]]:
 
 
 def _text_columns(path: Path) -> dict[str, NDArray[Any]]:
-    """KITTI raw `extract` scans: x y z intensity, one point per line."""
+    """Columns x y z intensity of a KITTI raw `extract` scan, one point per line; InputError for another number."""
     with input_errors(path, ValueError, as_what="lines of x y z intensity"):
         text = path.read_text(encoding="ascii")
         table = np.loadtxt(text.splitlines(), np.float32, ndmin=2) if text.strip() else np.zeros((0, 4), np.float32)

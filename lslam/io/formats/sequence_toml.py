@@ -237,7 +237,7 @@ _TABLES = {
 
 
 def _transform(path: Path | str, key: str, value: Any) -> Floats:
-    """3x4 or 4x4 rows, or the same numbers in one list, to a checked (4, 4) transform."""
+    """Transform (4, 4) of 3x4 or 4x4 rows, or the numbers in one list; raises InputError unless it is rigid."""
     try:
         numbers = np.asarray(value, np.float64).ravel()
     except (TypeError, ValueError):

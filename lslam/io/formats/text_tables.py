@@ -223,7 +223,7 @@ def _number(text: str) -> float:
 
 
 def seconds_to_ns(text: str, path: Path, line: int, scale: int = 1_000_000_000) -> int:
-    """Exact integer ns of a decimal number in a unit of `scale` ns (seconds by default)."""
+    """Exact integer ns of a decimal number in units of `scale` ns (default s); InputError if not finite or too large."""
     try:
         value = Decimal(text)
         is_finite = value.is_finite()

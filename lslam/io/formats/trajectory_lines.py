@@ -138,7 +138,7 @@ def write_tum(path: str | Path, trajectory: Trajectory, comment: str = "") -> No
 
 
 def find_times(path: str | Path) -> Path | None:
-    """Times file that belongs to a KITTI pose file: `times.txt` beside it, `times/NN.txt` or `sequences/NN/times.txt`."""
+    """Times file of a KITTI pose file: `times.txt` beside it, `times/NN.txt` or `sequences/NN/times.txt`; None without."""
     path = as_path(path)
     above = path.resolve().parent
     candidates = (
@@ -150,7 +150,7 @@ def find_times(path: str | Path) -> Path | None:
 
 
 def _stamps_of_kitti(path: Path, scans: Longs, times: Path | None) -> Longs | None:
-    """Stamps of the poses of `scans` (N,), from a file with one stamp per scan."""
+    """Stamps of the poses of `scans` (N,), of a file with one per scan; None without, InputError if `times` misfits."""
     source = find_times(path) if times is None else times
     if source is None:
         return None

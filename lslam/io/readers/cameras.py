@@ -59,7 +59,7 @@ def camera_of_files(name: str, info: CameraInfo, files: list[Path], stamps: Long
 
 
 def kitti_cameras(folder: Path, scans: list[Path], stamps_ns: Longs, T_cam0_lidar: Floats | None) -> list[Camera]:
-    """Camera 2 of a KITTI odometry sequence, rectified: image_2 with P2 of calib.txt, taken when the scanner looks ahead."""
+    """Rectified camera 2 of KITTI odometry, image_2 with P2 of calib.txt (else InputError), taken as the scanner looks ahead."""
     place = folder / "image_2"
     if not place.is_dir():
         return []
@@ -71,7 +71,7 @@ def kitti_cameras(folder: Path, scans: list[Path], stamps_ns: Longs, T_cam0_lida
 
 
 def kitti_raw_cameras(folder: Path) -> list[Camera]:
-    """Camera 2 of a KITTI raw drive, rectified (`sync`): image_02 with the calibration of its day."""
+    """Rectified camera 2 of a KITTI raw drive; raises InputError without calibration or stamps, or for `extract` drives."""
     place = folder / "image_02"
     if not (place / "data").is_dir():
         return []

@@ -168,7 +168,7 @@ class Folder:
 def _read_per_point(
     path: Path, count: int, names: tuple[str, ...]
 ) -> tuple[NDArray[np.float32] | None, NDArray[np.uint16] | None]:
-    """Times and rings of a scan's points, (count,) each; only those in `names` are read."""
+    """Times and rings (count,) of a scan that are in `names` and the file, else None; InputError for a damaged file."""
     with (
         input_errors(f"{path}, named by per_point of sequence.toml,", *DAMAGE),
         HEADERS,

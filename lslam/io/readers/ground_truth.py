@@ -157,7 +157,7 @@ def to_lidar(
 
 
 def _pair(truth: Trajectory, stamps_ns: Longs, files: list[Path], voice: Voice) -> Trajectory | None:
-    """Poses matched with the scans by file number or by index, with the scans' stamps."""
+    """Poses paired with scans by file number or index, at the scans' stamps; None, with a problem, without any."""
     numbers = scans_of(truth)
     count = int(numbers[-1]) + 1
     scans, rule = rows_of(files, count)

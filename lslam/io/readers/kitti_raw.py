@@ -378,7 +378,7 @@ def _samples(drive: Path) -> tuple[Oxts, Longs]:
 
 
 def _begin(drive: Path, first: int) -> tuple[int, str]:
-    """Time of the first scan, ns, and the file that states it. KITTI's times.txt counts from camera 0's first image."""
+    """First scan's time, ns, and its file; times.txt counts from camera 0's first image. InputError if no file tells."""
     sync = drive.with_name(drive.name.replace("_extract", "_sync"))
     for name in ("image_00", "velodyne_points", "oxts"):
         path = sync / name / "timestamps.txt"

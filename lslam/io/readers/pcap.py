@@ -94,7 +94,7 @@ def open_folder(path: Path, overrides: SequenceInfo, why: str) -> PcapSequence:
 
 
 def _opener(path: Path, datagrams: Datagrams) -> Callable[..., SpinningSensor]:
-    """Function that opens the packets, by their size: Velodyne's all have 1206 bytes and a flag, Ouster's need metadata."""
+    """Opener by packet size: Velodyne's have 1206 bytes and a flag, Ouster's need metadata; InputError for other packets."""
     of_size = np.flatnonzero(datagrams.sizes == velodyne_packets.SIZE)
     flags = datagrams.bytes_at(of_size, (0, 1))
     if (flags == velodyne_packets.FLAG).all(axis=1).any():

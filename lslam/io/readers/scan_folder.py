@@ -154,7 +154,7 @@ def _truth(folder: Folder, path: Path | None, stamps: Longs, calibration: Calibr
 
 
 def _mcd_extrinsics(folder: Folder) -> Floats | None:
-    """T_body_lidar of a Multi-Campus recording, where its calibration lies beside the scans."""
+    """T_body_lidar of a Multi-Campus recording, by the calibration beside the scans; None without one."""
     for path in sorted(folder.path.glob("*_calib.yaml")):
         T_body_lidar = folder.calibration(path, read_mcd_extrinsics)
         if T_body_lidar is not None:

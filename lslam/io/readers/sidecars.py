@@ -79,7 +79,7 @@ def vertical_correction(info: SequenceInfo, files: list[Path], record: PointReco
 
 
 def _top_elevation_deg(files: list[Path], record: PointRecord | None) -> float | None:
-    """99th percentile of elevation in the first scan that can be read, None when there is none."""
+    """99th percentile of elevation beyond 2 m in the first of five scans with 100 such points; None without one."""
     for _, cloud in readable(range(len(files[:5])), lambda k: read_points(files[k], record)):
         points = cloud.points[np.isfinite(cloud.points).all(1)]
         h = np.hypot(points[:, 0], points[:, 1])

@@ -143,9 +143,9 @@ class Window:
         )
 
     def solve(self, imu: ImuStream) -> tuple[Window, Floats]:
-        """The joint estimate by Gauss-Newton, and its information (12 + 15 W, 12 + 15 W), common errors first.
+        """Joint estimate by Gauss-Newton, and its information (12 + 15 W, 12 + 15 W), common errors first.
 
-        Where that is not positive definite the estimate is unchanged, and `newest` has no finite covariance.
+        Steps end where the information is not positive definite; the covariance of `newest` is not finite then.
         """
         window, H = self, np.zeros((0, 0))
         for _ in range(MOST_STEPS):

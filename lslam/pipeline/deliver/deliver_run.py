@@ -157,7 +157,7 @@ def _write_plan(folder: Path, survey: Survey, files: dict[str, str]) -> tuple[ND
 
 
 def _write_floor_plan(folder: Path, survey: Survey, files: dict[str, str]) -> None:
-    """Write floor_plan.tif if the run has an occupancy map. Its rows follow the run's axes, rotated in the projection's grid."""
+    """Write floor_plan.tif of the occupancy map, rotated to the run's axes, if there is one; InputError if damaged."""
     path = survey.folder / "occupancy.npz"
     if not path.is_file():
         return

@@ -172,7 +172,7 @@ def _drives(folder: Path, manifest: Mapping[str, Any]) -> dict[str, EarlierRun]:
 
 
 def _control(survey: Survey, projection: Projection) -> SurveyedPoints | None:
-    """Control points of the run, by its control.csv; None without any."""
+    """Control points of control.csv; None without any, InputError if the file has no positions."""
     path = survey.folder / "control.csv"
     if not path.is_file():
         return None

@@ -149,7 +149,7 @@ def _far_off(
 
 
 def _examine_clock(agreement: Agreement, rate_hz: float, findings: Findings) -> float | None:
-    """Time to add to the IMU's stamps, s; a finding if it matters and exceeds half a sample period."""
+    """Time to add to the IMU's stamps, s, a finding if above half a sample period; None if rotation does not tell it."""
     if not agreement.is_judged:
         return None
     offset, sigma = float(agreement.offset_s), float(agreement.offset_sigma_s)
@@ -166,7 +166,7 @@ def _examine_clock(agreement: Agreement, rate_hz: float, findings: Findings) -> 
 
 
 def _examine_axes(lidar_rates: Floats, imu_rates: Floats, R_lidar_imu: Floats) -> tuple[Finding, Floats] | None:
-    """Check for swapped, inverted or rotated axes. Returns the `R_lidar_imu` (3, 3) to use.
+    """Check for swapped, inverted or rotated axes. Returns the fit and `R_lidar_imu` (3, 3); None with too little rotation.
 
     lidar_rates, imu_rates : (M, 3) rates of the LiDAR's and the IMU's rotation, in the IMU's axes
     """

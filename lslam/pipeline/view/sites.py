@@ -295,7 +295,7 @@ class MapTiles:
         return {**self._tree, "nodes": {name: count for name, (_, count) in self._tree["nodes"].items()}}
 
     def node(self, name: str) -> bytes | None:
-        """A node as `write_octree` has it, and behind it the nearest pose, or trajectory, of each point, uint32."""
+        """A node as `write_octree` has it, then the nearest pose, or trajectory, of each point, uint32; None without points."""
         begin, count = self._tree.get("nodes", {}).get(name, (0, 0))
         if not count:
             return None
