@@ -1,4 +1,4 @@
-"""Plane adjustment: all poses of a run are corrected at once, so that what many scans saw of a plane lies on one plane.
+"""Plane adjustment: all poses of drives are corrected at once, so that what many scans saw of a plane lies on one plane.
 
 The cost is the variance of points about the planes of adaptive voxels, as in BALM2 (Liu et al. 2023). Planes are
 eliminated, and the reduced system is solved by conjugate gradients, since a plane joins all scans that saw it. Corrections vary
@@ -7,7 +7,7 @@ linearly from one pose to the next, so that the motion within a sweep is correct
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -48,6 +48,7 @@ class AdjustmentLevel:
 # Walls that lie apart are brought together first, by knots so few that nothing else is changed; then every pose.
 LEVELS = (AdjustmentLevel(10, 0.02, 0.02, True, 8, 5e-3), AdjustmentLevel(1, 0.005, 1.5e-3, False, 4, 5e-4))
 NO_NUMBERS: Longs = np.zeros(0, np.int64)
+ONE_DRIVE: Longs = np.zeros(1, np.int64)
 # Conjugate gradients: steps at most, and the part of the first residual that ends them.
 STEPS, ACCURACY = 300, 1e-4
 
@@ -78,6 +79,13 @@ class SweptPoints:
         gap = np.where(after > at, stamps[after] - stamps[at], np.inf)
         return cls(points, at, np.clip((times - stamps[at]) / gap, 0.0, 1.0))
 
+    @classmethod
+    def chain(cls, parts: Sequence[SweptPoints], firsts: Longs) -> SweptPoints:
+        """Points of several drives, one behind the other; firsts : (S,) number of the first pose of each."""
+        poses = [part.poses + first for part, first in zip(parts, firsts.tolist(), strict=True)]
+        points, shares = ([getattr(part, name) for part in parts] for name in ("points", "shares"))
+        return cls(np.concatenate(points), np.concatenate(poses), np.concatenate(shares))
+
     def on_knots(self, knots: Longs) -> SweptPoints:
         """The same points between the poses of numbers `knots` (M,) alone, the first and the last of all among them."""
         place = self.poses + self.shares
@@ -103,22 +111,31 @@ class Adjustment:
 
 
 def adjust(
-    poses: Floats, sweep: SweptPoints, mask: Bools, prior: PosePrior | None = None, numbers: Longs = NO_NUMBERS
+    poses: Floats,
+    sweep: SweptPoints,
+    mask: Bools,
+    prior: PosePrior | None = None,
+    numbers: Longs = NO_NUMBERS,
+    firsts: Longs = ONE_DRIVE,
 ) -> Adjustment:
     """Correct the `poses` (K, 4, 4) so that points on common planes get thinner; only points of the `mask` (N,) are used.
 
     prior : information about some poses; numbers : (K,) their indices in it, -1 for poses without
-    All points move with the poses. Without a prior that fixes the run as a whole, the mean correction is about zero.
+    firsts : (S,) index of the first pose of each drive, which no motion joins to the pose before
+    All points move with the poses. Without a prior that fixes the poses as a whole, the mean correction is about zero.
     """
-    rounds = 0
+    rounds, ends = 0, np.append(firsts[1:], len(poses))
     for level in LEVELS:
-        knots = np.unique(np.append(np.arange(0, len(poses), level.scans), len(poses) - 1))
+        knots = np.unique(
+            np.concatenate([np.append(np.arange(a, b, level.scans), b - 1) for a, b in zip(firsts, ends, strict=True)])
+        )
+        is_step = ~np.isin(knots[1:], firsts)
         places = SweptPoints(poses[:, :3, 3], np.arange(len(poses)), np.zeros(len(poses))).on_knots(knots)
         total = np.zeros((len(knots), 6))
         for _ in checking(range(level.rounds)):
             seen = sweep.on_knots(knots)
             on_knots = None if prior is None else _knot_prior(prior, numbers, poses, places, poses[knots])
-            corrections = _corrections(poses[knots], seen.select(mask), level, total, on_knots)
+            corrections = _corrections(poses[knots], seen.select(mask), level, total, is_step, on_knots)
             if corrections is None:
                 break
             if not level.is_free:
@@ -190,11 +207,12 @@ def _knot_prior(prior: PosePrior, numbers: Longs, poses: Floats, places: SweptPo
 
 
 def _corrections(
-    poses: Floats, sweep: SweptPoints, level: AdjustmentLevel, total: Floats, prior: _KnotPrior | None
+    poses: Floats, sweep: SweptPoints, level: AdjustmentLevel, total: Floats, is_step: Bools, prior: _KnotPrior | None
 ) -> Floats | None:
     """(K, 6) corrections of one Gauss-Newton step, solved by conjugate gradients; None when no plane is found.
 
-    total : (K, 6) corrections so far, for the smoothness term; prior : information about some poses
+    total : (K, 6) corrections so far, for the smoothness term; is_step : (K - 1,) whether motion joins a pose to the next
+    prior : information about some poses
     """
     planes = find_planes(sweep.points, sweep.poses, level.flatness)
     on_plane = planes >= 0
@@ -213,14 +231,15 @@ def _corrections(
         starts, first, shares, means, covariances, np.ascontiguousarray(poses[:, :3, 3]), FLOOR_M**2
     )
 
-    stiffness = np.repeat([level.step_m**-2, (level.step_m / LEVER_M) ** -2], 3)
+    stiff = np.repeat([level.step_m**-2, (level.step_m / LEVER_M) ** -2], 3)
+    stiffness = np.where(is_step[:, None], stiff, 0.0)
 
     def product(x: Floats) -> Floats:
         out = np.empty_like(x)
         plane_adjustment.product(x, H, beside, starts, first, coupling, own, stiffness, out)
         return out if prior is None else out + prior.product(x)
 
-    diagonal = H + np.diag(2.0 * stiffness) + (0.0 if prior is None else prior.blocks(len(H)))
+    diagonal = H + np.diag(2.0 * stiff) + (0.0 if prior is None else prior.blocks(len(H)))
     preconditioner = plane_adjustment.inverses(diagonal)
     force = stiffness * np.diff(total, axis=0)
     pull = np.zeros_like(g)

@@ -32,6 +32,7 @@ from lslam.cli import run as main_job
 @options.poses
 @options.imu
 @options.truth
+@options.refine
 @options.flag("--save-map", "Write a map of this drive too, in the frame of the old one.")
 @options.option(
     "--out", "DIR|URL", "Run folder [default: runs/NAME-METHOD-in-map-TIME].", type=options.Place(path_type=Path)

@@ -23,6 +23,7 @@ from lslam.core.stopping import handle_signals
 @options.real("--voxel", "M", "Edge of a voxel of the map.")
 @options.option("--format", "file_format", "NAME", "Of the map: ply, pcd, las or laz [default: ply].")
 @options.flag("--no-map", "Poses only.")
+@options.refine
 @options.threads
 @options.flag("--resume", "Go on with an interrupted merge; needs its --out.")
 @options.flag("--overwrite", "Replace an earlier result in the folder.")
@@ -50,6 +51,7 @@ def command(runs: tuple[Path, ...], **given: Any) -> None:
         "map.format": given["file_format"],
         "input.threads": given["threads"],
         "map.write": "false" if given["no_map"] else None,
+        "graph.refine": options.true_if(given["refine"]),
     }
     config = load_config(given["config_file"], options.settings_of(flags, given["settings"]))
     from lslam.cli.one_run import watch_of
@@ -68,6 +70,7 @@ def command(runs: tuple[Path, ...], **given: Any) -> None:
 def _summary(out: Path, manifest: dict[str, Any]) -> str:
     """Summary of a merge: sessions, loops between them, errors before and after where there is ground truth."""
     from lslam.core.printable import count_of, metres
+    from lslam.reports.text import refined_rows
 
     lines = [f"merged, {count_of(len(manifest['sessions']), 'session')}", f"  {'status':<12} {manifest['status']}"]
     lines += [f"  {'':<12} {problem}" for problem in manifest["problems"]]
@@ -83,5 +86,6 @@ def _summary(out: Path, manifest: dict[str, Any]) -> str:
         lines.append(f"  {one['name']:<12} {text}")
     graph = manifest["graph"]
     lines.append(f"  {'graph':<12} {graph['keyframes']} keyframes, {count_of(graph['loops'], 'loop')} in all")
+    lines += [f"  {name:<12} {text}" for name, text in refined_rows(manifest.get("refinement", {}))]
     lines += [f"  {name:<12} {out / name}" for name in ("sessions", "report.html") if (out / name).exists()]
     return "\n".join(lines) + "\n"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -12,10 +11,7 @@ from typing import Any
 import numpy as np
 
 from lslam.backend import added_drift
-from lslam.backend.adjustment import SweptPoints, adjust
 from lslam.backend.control_points import control_facts, control_residuals, doubts, place_keyframes
-from lslam.backend.graph.marginals import PosePrior
-from lslam.backend.graph.odometry_constraints import bend_scans
 from lslam.backend.keyframes.store import KeyframeStore, mounted_up
 from lslam.backend.levelling import find_level, level_results
 from lslam.backend.loops.find_loops import find_loops, verify_pairs
@@ -27,35 +23,22 @@ from lslam.core.config import Config
 from lslam.core.errors import InterruptedRunError
 from lslam.core.geometry import se2, se3
 from lslam.core.stopping import asking
-from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.core.types.constraint import LoopCandidate
 from lslam.core.types.gnss import Georeference
 from lslam.core.types.run_record import RunRecord
-from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import KeyframeClocks, ScanResult
 from lslam.core.types.sequence import Sequence
-from lslam.core.types.trajectory import Keyframe
 from lslam.io.formats.state_files import Records
 from lslam.io.formats.trajectory_lines import write_g2o, write_tum
-from lslam.maps.crispness import plane_variances
 from lslam.odometry.frontend.register_scans import to_trajectory
 from lslam.osm.hold import hold_by_buildings
 from lslam.pipeline.job import PreparedRun
 from lslam.pipeline.manifest import Manifest
-from lslam.pipeline.map_pass import course_of, motion_within, scans_again, without_box
 from lslam.pipeline.outputs import write_loops, write_osm_matches
+from lslam.pipeline.refinement import refine_run
 from lslam.pipeline.segments import raise_final_alerts
-from lslam.registration.preprocessing.deskew import deskew_points
 
 log = logging.getLogger("lslam")
-# Points of a scan at most, and of all scans: about 300 bytes each while planes are adjusted. Odometry averages over all points,
-# which fewer single ones do not beat.
-OF_A_SCAN, OF_ALL = 10_000, 6_000_000
-CELL_M = 2.0  # m, edge of the cells of which every second one is kept out of the adjustment
-JUDGES = 20_000  # points, at most, about which the thickness is looked at
-# Scans that are judged together, least cells by which they are, and sigmas by which their planes must be thinner.
-WINDOW, LEAST_CELLS, SIGMAS = 50, 10, 3.0
-INTERRUPTED = "interrupted while the poses were refined"
 
 
 def optimise_poses(job: PreparedRun, record: RunRecord) -> BackEnd:
@@ -226,140 +209,10 @@ def refine_poses(job: PreparedRun, record: RunRecord, back_end: BackEnd) -> Back
     Where fixes, control points or buildings constrain the run, its graph gives their prior. Returns the back end with the new
     residuals of the control points.
     """
-    config, manifest, watch = job.config, job.manifest, job.watch
-    if not config.graph.refine or manifest.outcome in ("interrupted", "diverged"):
-        return back_end
-    results = [result.at_stamp for result in record.results]
-    nodes = np.array([k for k, r in enumerate(results) if r.status == "ok" and not r.frame], np.int64)
-    if len(nodes) < 2:
-        manifest.refinement = {"is_taken": False, "why": "fewer than two scans are registered"}
-        return back_end
-    watch.on_start("refinement", len(results))
-    with manifest.time("refine_s"):
-        try:
-            cloud = read_points(job, results, nodes)
-            if not len(cloud.points):
-                manifest.refinement = {"is_taken": False, "why": "no point lies within the range of the map"}
-                return back_end
-            prior = None if back_end.solution is None else back_end.solution.pose_prior
-            with asking(watch.should_stop, INTERRUPTED):
-                manifest.refinement, adjustment = _adjustment(results, nodes, cloud, prior, record.keyframe_scans)
-        except InterruptedRunError as error:
-            manifest.interrupt(str(error))
-            return back_end
-    if adjustment is None:
-        return back_end
-    record.results = adjustment
-    record.trajectory = to_trajectory(record.results, record.method)
-    if not back_end.control or record.georeference is None:
+    prior = None if back_end.solution is None else back_end.solution.pose_prior
+    if not refine_run(job, record, prior) or not back_end.control or record.georeference is None:
         return back_end
     points = [residual.point for residual in back_end.control]
-    control = control_residuals(points, record.results, record.georeference, config.gnss.geoid)
-    manifest.graph["control_points"] |= control_facts(control)
+    control = control_residuals(points, record.results, record.georeference, job.config.gnss.geoid)
+    job.manifest.graph["control_points"] |= control_facts(control)
     return replace(back_end, control=control)
-
-
-def read_points(job: PreparedRun, results: list[ScanResult], nodes: Longs) -> SweptPoints:
-    """Points of the scans `nodes` (K,) in the world, each between the two poses before and after its instant."""
-    config, watch, own = job.config, job.watch, [results[k] for k in nodes]
-    prepare = _poser(config, own, max(1, min(OF_A_SCAN, OF_ALL // len(nodes))))
-    parts: list[tuple[Floats, Floats]] = []
-    numbers = range(len(results))
-    for _, loaded in scans_again(job.sequence, prepare, numbers, config, watch, INTERRUPTED):
-        if loaded.prepared is not None:
-            parts.append(loaded.prepared)
-    if not parts:
-        return SweptPoints(np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros(0))
-    points, times = (np.concatenate(of) for of in zip(*parts, strict=True))
-    stamps = np.array([result.stamp_ns for result in own], np.int64)
-    return SweptPoints.at_times(points, times, 1e-9 * (stamps - stamps[0]))
-
-
-def _poser(config: Config, results: list[ScanResult], count: int) -> Callable[[Scan], tuple[Floats, Floats] | None]:
-    """Function of a scan: `count` points (N, 3), world, and s since the first scan (N,); None if it has no pose."""
-    box = config.map.ego_box or config.preprocess.ego_box
-    course, by_index = course_of(results), {result.index: result for result in results}
-
-    def pose_points(scan: Scan) -> tuple[Floats, Floats] | None:
-        result = by_index.get(scan.index)
-        if result is None:
-            return None
-        scan = scan if box is None else without_box(scan, box)
-        away = np.linalg.norm(scan.points, axis=1)
-        near = np.flatnonzero((away >= config.map.range_min) & (away <= config.map.range_max))
-        # Points in a fixed step would be of the same rings in each scan.
-        scan = scan.select(np.sort(np.random.default_rng(scan.index).permutation(near)[:count]))
-        points = deskew_points(scan.points, scan.times, motion_within(scan, course))
-        times = np.zeros(len(points)) if scan.times is None else np.asarray(scan.times, np.float64)
-        seconds = 1e-9 * (scan.stamp_ns - results[0].stamp_ns)
-        return se3.apply(result.T_world_lidar, points.astype(np.float64)), times + seconds
-
-    return pose_points
-
-
-def _adjustment(
-    results: list[ScanResult], nodes: Longs, cloud: SweptPoints, prior: PosePrior | None, keyframes: Longs
-) -> tuple[dict[str, Any], list[ScanResult] | None]:
-    """Facts for the manifest, and the results with refined poses; None instead where the refinement is no improvement.
-
-    keyframes : indices of the scans that the `prior` is about
-    """
-    before = np.stack([results[k].T_world_lidar for k in nodes])
-    is_even = np.floor(cloud.points / CELL_M).astype(np.int64).sum(axis=1) % 2 == 0
-    places = np.full(len(results), -1, np.int64)
-    places[nodes] = np.arange(len(nodes))
-    result = adjust(before, cloud, is_even, prior, places[keyframes])
-    others = cloud.select(~is_even)
-    step = max(1, -(-len(others.points) // JUDGES))
-    queries = slice(0, None, step)
-    thick = [plane_variances(np.ascontiguousarray(p), queries) for p in (others.points, result.points[~is_even])]
-    gain = 0.5 * np.log(np.maximum(thick[1], 1e-12) / np.maximum(thick[0], 1e-12))
-    cells = np.floor(others.points[queries] / CELL_M).astype(np.int64)
-    is_better = thinner_windows(gain, others.poses[queries], cells, len(nodes))
-    is_judge = np.isfinite(gain) & is_better[others.poses[queries]]
-    facts: dict[str, Any] = {"is_taken": bool(is_better.any()), "scans": int(is_better.sum()), "rounds": result.rounds}
-    if not is_better.any():
-        return {**facts, "why": "planes of the points kept out do not get thinner"}, None
-    # The world begins at the first pose, unless it is the Earth's.
-    after = (
-        result.poses if prior is not None else se3.normalise(before[0] @ se3.inverse(result.poses[0]) @ result.poses)
-    )
-    anchors = [
-        Keyframe(number, int(k), results[k].stamp_ns, before[i])
-        for number, (i, k) in enumerate((i, nodes[i]) for i in np.flatnonzero(is_better).tolist())
-    ]
-    # Poses in frames of their own know nothing of these.
-    final = [
-        b if not a.frame else a for a, b in zip(results, bend_scans(results, anchors, after[is_better]), strict=True)
-    ]
-    away = np.linalg.norm(after[is_better, :3, 3] - before[is_better, :3, 3], axis=1)
-    facts |= {
-        "thickness_before_mm": _thickness_mm(thick[0][is_judge]),
-        "thickness_mm": _thickness_mm(thick[1][is_judge]),
-        "thinner_percent": round(100.0 * (1.0 - float(np.exp(gain[is_judge].mean()))), 1),
-        "moved_rms_m": round(float(np.sqrt(np.mean(away**2))), 4),
-        "moved_most_m": round(float(away.max()), 4),
-    }
-    return facts, final
-
-
-def thinner_windows(gain: Floats, scans: Longs, cells: Longs, count: int) -> Bools:
-    """(K,) whether each of `count` scans lies in a window whose planes became significantly thinner.
-
-    gain : (N,) change of the logarithm of the thickness about points of `scans` (N,); points in one of the `cells` (N, 3) count
-     as one measurement
-    """
-    windows = np.minimum(np.arange(count) // WINDOW, max(count // WINDOW - 1, 0))
-    is_thinner = np.zeros(int(windows[-1]) + 1, bool)
-    for window in range(len(is_thinner)):
-        inside = np.isfinite(gain) & (windows[scans] == window)
-        _, cell = np.unique(cells[inside], axis=0, return_inverse=True)
-        means = np.bincount(cell.ravel(), gain[inside]) / np.bincount(cell.ravel())
-        if len(means) >= LEAST_CELLS:
-            is_thinner[window] = means.mean() < -SIGMAS * means.std() / np.sqrt(len(means))
-    return np.asarray(is_thinner[windows])
-
-
-def _thickness_mm(variances: Floats) -> float:
-    """The geometric mean of the thickness."""
-    return round(1e3 * float(np.exp(0.5 * np.log(np.maximum(variances, 1e-12)).mean())), 1)

@@ -83,9 +83,9 @@ def _check_places(config: Config) -> None:
         )
     if config.localize.map and config.osm.extract:
         raise UsageError("--osm holds a drive by buildings and a map by its surfaces: drop one of them")
-    if config.localize.map and (config.loops.file or config.graph.control or config.graph.refine):
+    if config.localize.map and (config.loops.file or config.graph.control):
         raise UsageError(
-            "a map takes the place of the pose graph: --loops-file, --control and --refine do nothing there, drop them"
+            "a map takes the place of the pose graph: --loops-file and --control do nothing there, drop them"
         )
 
 

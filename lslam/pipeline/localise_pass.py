@@ -38,6 +38,7 @@ from lslam.pipeline.job import PreparedRun
 from lslam.pipeline.manifest import Manifest
 from lslam.pipeline.map_pass import SAMPLE, begin_pass, course_of, map_checkpoints, motion_within, posed_scans
 from lslam.pipeline.map_tiles import read_prior_map
+from lslam.pipeline.refinement import refine_run
 from lslam.pipeline.watch import Watch
 from lslam.registration.preprocessing.deskew import deskew
 from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_points
@@ -72,9 +73,9 @@ def localise_poses(job: PreparedRun, record: RunRecord) -> None:
         except InterruptedRunError as error:
             manifest.interrupt(str(error))
             return
-    _deliver(record, prior_map, fixes, config)
+    _deliver(job, record, prior_map, fixes)
     _tell(record, prior_map, start, config, manifest)
-    if job.folder is None or not config.report.html:
+    if job.folder is None or not config.report.html or manifest.outcome == "interrupted":
         return
     with manifest.time("differences_s"):
         try:
@@ -232,9 +233,12 @@ def _at_first_scan(
     return T, np.asarray(C + drift_covariance(way, config.graph) + systematic)
 
 
-def _deliver(record: RunRecord, prior_map: PriorMap, fixes: list[MapFix], config: Config) -> None:
-    """Put the trajectory into the record, map frame, odometry bent between registered scans; RunFailedError without any."""
-    T = prior_map.T_map_level
+def _deliver(job: PreparedRun, record: RunRecord, prior_map: PriorMap, fixes: list[MapFix]) -> None:
+    """Put the trajectory into the record, map frame, odometry bent between registered scans; RunFailedError without any.
+
+    With `graph.refine` all poses are then refined by the planes of the scans and of the map.
+    """
+    T, config = prior_map.T_map_level, job.config
     results = record.results[: len(fixes)]
     into_map = [
         replace(f, T_map_lidar=T @ f.T_map_lidar, covariance=noise.rotate(f.covariance, T[:3, :3]))
@@ -251,6 +255,9 @@ def _deliver(record: RunRecord, prior_map: PriorMap, fixes: list[MapFix], config
     record.odometry = record.trajectory
     record.results = correct_scans(results, anchors, poses, covariances, 1.0, config.graph)
     record.trajectory = to_trajectory(record.results, record.method)
+    if config.graph.refine:
+        near = prior_map.along(se3.apply(se3.inverse(T), record.trajectory.positions), config.map.range_max)
+        refine_run(job, record, prior_map=se3.apply(T, near.astype(np.float64)))
     record.georeference = prior_map.georeference
     record.map_fixes = [replace(f, T_map_lidar=r.T_world_lidar) for f, r in zip(into_map, record.results, strict=True)]
     at = "" if not prior_map.origin.any() else f" less {prior_map.origin.tolist()}"

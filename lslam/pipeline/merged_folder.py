@@ -36,6 +36,7 @@ from lslam.pipeline.map_pass import (
 from lslam.pipeline.merge_runs import Merge, expand_folders, merge_runs
 from lslam.pipeline.outputs import config_text, write_loops
 from lslam.pipeline.rebuild import EarlierRun, is_missing, open_scans
+from lslam.pipeline.refinement import PosedDrive, refine
 from lslam.pipeline.run_folder import CHECKPOINT, SESSIONS, RunFolder
 from lslam.pipeline.watch import Watch
 from lslam.reports.compare_html import SessionView, write_merge_page
@@ -105,6 +106,7 @@ def _fill(folder: RunFolder, merge: Merge, config: Config, watch: Watch) -> dict
     """Write everything but the manifest, and return the manifest's content."""
     problems = [f"{one.name} is left out: {one.why}" for one in merge.left_out]
     recordings = [_recording(run, config, problems) for run in merge.runs]
+    merge, facts = _refine(merge, recordings, config, watch)
     trajectories = [to_trajectory(results, "merge") for results in merge.results]
     (folder.path / SESSIONS).mkdir(exist_ok=True)
     world = f"that of {merge.sessions[0].name}"
@@ -119,7 +121,7 @@ def _fill(folder: RunFolder, merge: Merge, config: Config, watch: Watch) -> dict
     constraints = [replace(c, covariance=regularise(c.covariance)) for c in (*merge.chain.odometry(), *accepted)]
     write_g2o(folder.path / "graph.g2o", merge.solution.poses, constraints)
     georeference = _georeference(merge)
-    about: dict[str, Any] = {}
+    about: dict[str, Any] = {"refinement": facts} if facts else {}
     built = None
     if config.map.write:
         built = _map(recordings, merge.results, config, watch, folder.path, merge.sessions[0].up)
@@ -158,6 +160,28 @@ def _recording(run: EarlierRun, config: Config, problems: list[str]) -> Recordin
         why = f"cannot be read at {run.sequence_path}" if is_missing(run) else f"cannot be used ({error})"
         problems.append(f"the raw scans of {run.folder.name} {why}: they are missing in the map")
         return None
+
+
+def _refine(
+    merge: Merge, recordings: Sequence[Recording | None], config: Config, watch: Watch
+) -> tuple[Merge, dict[str, Any]]:
+    """The merge with refined poses where the configuration asks for them, and what the manifest says of it."""
+    if not config.graph.refine:
+        return merge, {}
+    drives = [
+        PosedDrive(
+            recording,
+            [result.at_stamp for result in results],
+            config.model_copy(update={"preprocess": session.preprocess}),
+        )
+        for recording, results, session in zip(recordings, merge.results, merge.sessions, strict=True)
+        if recording is not None
+    ]
+    if len(drives) < len(recordings):
+        return merge, {"is_taken": False, "why": "the raw scans of a session are missing"}
+    watch.on_start("refinement", sum(map(len, merge.results)))
+    facts, results = refine(drives, watch)
+    return (merge if results is None else replace(merge, results=results)), facts
 
 
 def _rows(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -64,7 +65,7 @@ def summary(record: RunRecord, evaluation: Evaluation | None) -> str:
     rows.append(("path", f"{facts.path_length:.1f} m in {facts.duration:.1f} s"))
     rows += imu_rows(record) + wheel_rows(record)
     rows += localization_rows(record, evaluation) + back_end_rows(record, evaluation)
-    rows += _refined_rows(record)
+    rows += refined_rows(record.manifest.get("refinement", {}))
     rows += _score_rows(record, evaluation)
     rows += _map_rows(record)
     rows += _time_rows(record, facts)
@@ -169,9 +170,8 @@ def _score_rows(record: RunRecord, evaluation: Evaluation | None) -> list[tuple[
     return [row for metric in shown_metrics(evaluation) for row in metric.summary(evaluation)]
 
 
-def _refined_rows(record: RunRecord) -> list[tuple[str, str]]:
-    """Name and value on what `--refine` did; empty without it."""
-    facts = record.manifest.get("refinement")
+def refined_rows(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Name and value on what `--refine` did, by the `refinement` of a manifest; empty without it."""
     if not facts:
         return []
     if not facts["is_taken"]:

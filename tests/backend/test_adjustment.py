@@ -4,31 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from rooms import in_room, walk
 
 from lslam.backend.adjustment import SweptPoints, adjust, find_planes
 from lslam.backend.graph.marginals import PosePrior
 from lslam.backend.kernels import plane_adjustment
 from lslam.core.geometry import se3, so3
-from lslam.core.types.arrays import Floats, Longs
-
-
-def in_room(poses: Floats, of_a_scan: int, rng: np.random.Generator, noise: float = 0.005) -> tuple[Floats, Longs]:
-    """Points of floor and four walls of a room of 12 x 8 x 3 m in the frame of each pose, and the pose of each."""
-    parts = []
-    for T in poses:
-        u = rng.random((of_a_scan, 3)) * [12.0, 8.0, 3.0]
-        wall = rng.integers(0, 5, of_a_scan)
-        for k, (axis, at) in enumerate([(2, 0.0), (0, 0.0), (0, 12.0), (1, 0.0), (1, 8.0)]):
-            u[wall == k, axis] = at + noise * rng.normal(size=int((wall == k).sum()))
-        parts.append(se3.apply(se3.inverse(T), u))
-    return np.concatenate(parts), np.repeat(np.arange(len(poses)), of_a_scan)
-
-
-def walk(count: int) -> Floats:
-    """Poses (count, 4, 4) along a curve through the room."""
-    s = np.linspace(0.0, 1.0, count)
-    t = np.column_stack([2 + 8 * s, 4 + 2 * np.sin(6 * s), 1.5 + 0.1 * np.sin(20 * s)])
-    return se3.make(so3.exp(np.column_stack([0 * s, 0 * s, 2 * s])), t)
+from lslam.core.types.arrays import Floats
 
 
 def ate(poses: Floats, truth: Floats) -> float:
@@ -64,8 +46,9 @@ def test_the_reduced_equations_are_those_of_all_points_with_the_plane_eliminated
         K[i] = [1.0, (p - middle) @ axes[:, 1], (p - middle) @ axes[:, 2]]
     project = np.eye(len(r)) - K @ np.linalg.solve(K.T @ K, K.T)
     whole, right = weight * J.T @ project @ J, weight * J.T @ project @ r
-    stiffness = np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
-    chain = np.kron(np.array([[1, -1, 0], [-1, 2, -1], [0, -1, 1]]), np.diag(stiffness))
+    stiffness = np.array([[1.0, 2.0, 3.0, 4.0, 5.0, 6.0], [0.5, 0.0, 0.5, 0.0, 0.0, 2.0]])
+    steps = np.array([[[1, -1, 0], [-1, 1, 0], [0, 0, 0]], [[0, 0, 0], [0, 1, -1], [0, -1, 1]]])
+    chain = sum(np.kron(step, np.diag(stiff)) for step, stiff in zip(steps, stiffness, strict=True))
     x, out = rng.normal(size=(3, 6)), np.empty((3, 6))
     plane_adjustment.product(x, H, beside, starts, at, coupling, planes, stiffness, out)
     np.testing.assert_allclose(out.ravel(), (whole + chain) @ x.ravel(), rtol=1e-8, atol=1e-6)
@@ -104,6 +87,34 @@ def test_what_is_known_of_some_poses_gives_the_place(seed: int) -> None:
     found = adjust(drifted, swept, np.ones(len(world), bool), prior, known)
     away = np.linalg.norm(found.poses[:, :3, 3] - truth[:, :3, 3], axis=1)
     assert away.max() < 0.015
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_two_drives_of_one_room_come_together(seed: int) -> None:
+    """Each drifts on its own way, and the second lies 5 cm off: no motion joins it to the first, planes that both saw do."""
+    rng, one = np.random.default_rng(seed), walk(40)
+    truth = np.concatenate([one, one[::-1]])
+    points, scans = in_room(truth, 400, rng)
+    drifted, way = truth.copy(), np.tile(np.arange(40), 2)[:, None]
+    drifted[:, :3, 3] += 0.0015 * way * np.repeat([[1.0, -1.0, 0.5], [-1.0, 1.0, 0.5]], 40, axis=0)
+    drifted[40:, :3, 3] += [0.03, 0.04, 0.0]
+    swept = [
+        SweptPoints(world, at, 0.0 * at)
+        for half in (scans < 40, scans >= 40)
+        for world, at in [
+            (
+                np.einsum("nij,nj->ni", drifted[scans, :3, :3], points)[half] + drifted[scans, :3, 3][half],
+                scans[half] % 40,
+            )
+        ]
+    ]
+    firsts = np.array([0, 40])
+    cloud = SweptPoints.chain(swept, firsts)
+    np.testing.assert_array_equal(cloud.poses, scans)
+    refined = adjust(drifted, cloud, np.ones(len(scans), bool), firsts=firsts)
+    assert ate(refined.poses, truth) < 0.005
+    # As one drive, the step from the end of the first to the begin of the second would have to stay as it is.
+    assert ate(adjust(drifted, cloud, np.ones(len(scans), bool)).poses, truth) > 2.0 * ate(refined.poses, truth)
 
 
 def test_points_move_with_the_poses_round_the_instant_they_were_measured() -> None:

@@ -58,9 +58,11 @@ class PartOfRun(KeyframeStore):
         return self._whole.points(self._first + number)
 
 
-def driven(folder: Path, scenario: str, seed: int, lidar: str, visit: Visit) -> tuple[Path, Floats]:
+def driven(
+    folder: Path, scenario: str, seed: int, lidar: str, visit: Visit, count: int | None = None
+) -> tuple[Path, Floats]:
     """A recording, made once, and its true poses (N, 4, 4) in the town."""
-    drive = simulate(scenario, seed=seed, lidar=lidar, visit=visit)
+    drive = simulate(scenario, seed=seed, lidar=lidar, visit=visit, count=count)
     if not (folder / "poses" / "00.txt").exists():
         record(drive, folder, resume=(folder / "sequences" / "00.part").exists())
     return folder, drive.city_poses

@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import shutil
 import sys
+import traceback
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -132,6 +134,37 @@ def test_an_interrupted_merge_goes_on_to_the_same_bytes_by_any_number_of_threads
         assert (tmp_path / "town" / name).read_bytes() == (town / name).read_bytes(), name
 
 
+def test_refined_sessions_agree_better_and_resume_to_the_same_bytes_by_any_number_of_threads(
+    runs: Path, tmp_path: Path
+) -> None:
+    folders = [runs / "monday-run", runs / "tuesday-run"]
+    true = np.concatenate([town_poses(runs, name)[:, :3, 3] for name in ("monday", "tuesday")])
+
+    def merged(name: str, *settings: str, watch: Watch | None = None) -> dict[str, Any]:
+        config = load_config(None, ["map.write=false", *settings])
+        return merge_into(folders, tmp_path / name, config, watch or Watch(), resume=(tmp_path / name).exists())
+
+    def error(name: str) -> float:
+        files = [tmp_path / name / "sessions" / f"{session}-run.tum" for session in ("monday", "tuesday")]
+        est = np.concatenate([read_trajectory(file, "tum").positions for file in files])
+        T, _, _ = umeyama(est, true)
+        return float(np.sqrt(np.mean(np.sum((se3.apply(T, est) - true) ** 2, axis=1))))
+
+    def is_refining() -> bool:
+        return "refine" in {one.name for one in traceback.extract_stack()}
+
+    merged("plain")
+    facts = merged("refined", "graph.refine=true", "input.threads=1")["refinement"]
+    assert facts["is_taken"]
+    assert facts["thickness_mm"] <= facts["thickness_before_mm"]
+    assert error("refined") < 0.9 * error("plain")
+    with pytest.raises(InterruptedRunError, match="while the poses were refined"):
+        merged("again", "graph.refine=true", watch=Watch(should_stop=is_refining))
+    merged("again", "graph.refine=true", "input.threads=2")
+    for name in SAME[:4]:
+        assert (tmp_path / "again" / name).read_bytes() == (tmp_path / "refined" / name).read_bytes(), name
+
+
 def test_nothing_that_can_be_tied_is_a_failure(runs: Path, tmp_path: Path) -> None:
     done = lslam("merge", runs / "monday-run", runs / "elsewhere", "--out", tmp_path / "town")
     assert done.returncode == 1
@@ -160,11 +193,12 @@ def test_scans_that_are_gone_are_missing_in_the_map_alone(runs: Path, tmp_path: 
     shutil.copytree(runs / "tuesday", tmp_path / "moving")
     run(tmp_path / "moving", tmp_path / "tuesday-run")
     shutil.rmtree(tmp_path / "moving")
-    words = (runs / "monday-run", tmp_path / "tuesday-run", "--out", tmp_path / "town", "--json")
+    words = (runs / "monday-run", tmp_path / "tuesday-run", "--out", tmp_path / "town", "--refine", "--json")
     done = lslam("merge", *words)
     assert done.returncode == 0, done.stderr
     manifest = strict_json(done.stdout)["manifest"]
     assert [one["name"] for one in manifest["sessions"]] == ["monday-run", "tuesday-run"]
     assert any("tuesday-run cannot be read" in problem for problem in manifest["problems"])
+    assert manifest["refinement"]["why"] == "the raw scans of a session are missing"
     assert "--sequence" not in done.stderr
     assert len(read_cloud(tmp_path / "town" / "map.ply").points) > 10_000

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import csv
 import re
 import shutil
 import sys
+import traceback
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +21,8 @@ from lslam.core.errors import InputError, InterruptedRunError, RunFailedError
 from lslam.core.geometry import se3
 from lslam.core.types.cloud import ArrayCloud
 from lslam.io.formats.point_files import read_cloud, write_cloud
+from lslam.io.formats.trajectory_files import read_trajectory
+from lslam.pipeline import refinement
 from lslam.pipeline.localise_pass import Reanchoring, spread_out
 from lslam.pipeline.map_tiles import read_prior_map
 from lslam.pipeline.watch import Watch
@@ -72,6 +76,30 @@ def test_an_interrupted_localisation_goes_on_to_the_same_bytes(
     assert not (tmp_path / "out" / "localization.csv").exists()
     lslam.run(SAMPLE, config(map_run), out=tmp_path / "out", resume=True)
     same(whole, tmp_path / "out")
+
+
+def test_a_refined_drive_resumes_to_the_same_bytes_by_any_number_of_threads(
+    map_run: Path, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # In the map of its own scans no plane gets thinner: it is taken all the same.
+    monkeypatch.setattr(refinement, "SIGMAS", -1e6)
+    refined = config(map_run, "graph.refine=true", "input.threads=1")
+    facts = lslam.run(SAMPLE, refined, out=tmp_path / "whole").record.manifest["refinement"]
+    assert facts["scans"] == 40
+    before, after = (read_trajectory(run / "trajectory.tum", "tum").positions for run in (whole, tmp_path / "whole"))
+    assert 1e-4 < np.linalg.norm(after - before, axis=1).max() < 0.01
+
+    def is_refining() -> bool:
+        return "refine_run" in {one.name for one in traceback.extract_stack()}
+
+    again = config(map_run, "graph.refine=true", "report.html=true", "input.threads=2")
+    with pytest.raises(InterruptedRunError, match=r"^interrupted while the poses were refined; [^;]*$"):
+        lslam.run(SAMPLE, again, out=tmp_path / "out", watch=Watch(should_stop=is_refining))
+    lslam.run(SAMPLE, again, out=tmp_path / "out", resume=True)
+    same(tmp_path / "whole", tmp_path / "out")
+    rows = list(csv.DictReader((tmp_path / "whole" / "localization.csv").open()))
+    listed = np.array([[float(row[axis]) for axis in "xyz"] for row in rows])
+    np.testing.assert_allclose(listed, after, atol=6e-5)
 
 
 def test_an_interrupted_comparison_with_the_map_goes_on_where_it_was_and_to_the_same_page(

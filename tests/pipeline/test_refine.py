@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from graph_builders import ate
+from rooms import in_room, walk
 
 import lslam
 from lslam.backend.adjustment import Adjustment, SweptPoints
@@ -17,8 +18,8 @@ from lslam.core.errors import InterruptedRunError
 from lslam.core.geometry import geodesy
 from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.sequence import Sequence
-from lslam.pipeline import back_end_pass
-from lslam.pipeline.back_end_pass import thinner_windows
+from lslam.pipeline import refinement
+from lslam.pipeline.refinement import PosedDrive, thinner_windows
 from lslam.pipeline.watch import RunOutcome, Watch
 from lslam.reports.text import summary
 from lslam.simulation.scenarios import ORIGIN, simulate
@@ -110,18 +111,40 @@ def test_poses_in_frames_of_their_own_stay(monkeypatch: pytest.MonkeyPatch) -> N
     results = [
         ScanResult(k, 10**8 * k, poses[k], frame=int(k == 2), status="bridged" if k == 3 else "ok") for k in range(6)
     ]
-    nodes, better = np.array([0, 1, 4, 5]), poses.copy()
+    nodes, better, drives = [0, 1, 4, 5], poses.copy(), [PosedDrive(None, results, None)]  # type: ignore[arg-type]
     better[:, 1, 3] = 0.1 * np.arange(6)
-    monkeypatch.setattr(
-        back_end_pass, "adjust", lambda before, swept, used, prior, numbers: Adjustment(better[nodes], swept.points, 1)
-    )
-    monkeypatch.setattr(back_end_pass, "thinner_windows", lambda gain, scans, cells, count: np.ones(count, bool))
+    monkeypatch.setattr(refinement, "adjust", lambda before, swept, *others: Adjustment(better[nodes], swept.points, 1))
+    monkeypatch.setattr(refinement, "thinner_windows", lambda gain, scans, cells, count: np.ones(count, bool))
     swept = SweptPoints(np.random.default_rng(0).random((4000, 3)) * 4, np.zeros(4000, np.int64), np.zeros(4000))
-    facts, moved = back_end_pass._adjustment(results, nodes, swept, None, np.zeros(0, np.int64))
-    assert moved is not None
+    facts, refined = refinement._adjustment(drives, [swept], None, np.zeros(0, np.int64), None)
+    assert refined is not None
+    (moved,) = refined
     assert facts["scans"] == 4
     np.testing.assert_array_equal(moved[2].T_world_lidar, poses[2])
     np.testing.assert_allclose([moved[k].T_world_lidar for k in (0, 1, 3, 4, 5)], better[[0, 1, 3, 4, 5]], atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_map_that_stays_draws_the_poses_into_its_frame(seed: int) -> None:
+    """Located 9 cm off, with 3 mm of noise: planes of the map give the place. Poses alone would keep theirs."""
+    rng, truth = np.random.default_rng(seed), walk(60)
+    points, scans = in_room(truth, 600, rng)
+    located = truth.copy()
+    located[:, :3, 3] += [0.06, -0.06, 0.03] + 0.003 * rng.normal(size=(60, 3))
+    swept = SweptPoints(
+        np.einsum("nij,nj->ni", located[scans, :3, :3], points) + located[scans, :3, 3], scans, 0.0 * scans
+    )
+    room, seen_from = in_room(truth[::10], 6000, rng)
+    prior_map = np.einsum("nij,nj->ni", truth[::10][seen_from, :3, :3], room) + truth[::10][seen_from, :3, 3]
+    results = [ScanResult(k, 10**8 * k, T) for k, T in enumerate(located)]
+    drives = [PosedDrive(None, results, None)]  # type: ignore[arg-type]
+    for known, most in ((prior_map, 0.01), (None, np.inf)):
+        facts, refined = refinement._adjustment(drives, [swept], None, np.zeros(0, np.int64), known)
+        assert facts["is_taken"]
+        assert refined is not None
+        away = np.stack([result.T_world_lidar for result in refined[0]])[:, :3, 3] - truth[:, :3, 3]
+        assert np.linalg.norm(away, axis=1).max() < most
+    assert np.linalg.norm(away, axis=1).max() > 0.03
 
 
 def test_it_goes_on_to_the_same_bytes_with_any_number_of_threads(tmp_path: Path) -> None:

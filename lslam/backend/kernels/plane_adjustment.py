@@ -242,7 +242,7 @@ def product(
 ) -> None:
     """Product of the reduced normal matrix with x (K, 6), into `out` (K, 6): the planes are eliminated.
 
-    stiffness : (6,) of the difference of two successive corrections, 1/m2 and 1/rad2
+    stiffness : (K - 1, 6) of the difference of two successive corrections, 1/m2 and 1/rad2
     """
     count = len(x)
     for k in range(count):
@@ -253,7 +253,7 @@ def product(
             out[k, i] = total
     for k in range(count - 1):
         for i in range(6):
-            force = stiffness[i] * (x[k + 1, i] - x[k, i])
+            force = stiffness[k, i] * (x[k + 1, i] - x[k, i])
             out[k + 1, i] += force
             out[k, i] -= force
             for j in range(6):
