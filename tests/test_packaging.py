@@ -288,7 +288,7 @@ def test_a_wheel_needs_no_checkout_for_the_demo(tmp_path: Path) -> None:
     env = {**os.environ, "PYTHONPATH": str(site), "NUMBA_CACHE_DIR": str(tmp_path / "kernels")}
     start = resource.getrusage(resource.RUSAGE_CHILDREN)
     done = subprocess.run(
-        [sys.executable, "-P", "-m", "lslam", "demo", "--no-open", "--json"],
+        [sys.executable, "-P", "-m", "lslam", "demo", "--no-browser", "--json"],
         env=env, cwd=tmp_path, capture_output=True, text=True, check=False,
     )  # fmt: skip
     end = resource.getrusage(resource.RUSAGE_CHILDREN)

@@ -17,13 +17,13 @@ from lslam.cli.console import log, open_page, progress, setup_logging, show
 SCENARIO, LIDAR, SCANS = "block", "vlp16", 95
 
 
-@click.command(epilog="\b\nExamples: lslam demo\n          lslam demo --no-open --out tour")
+@click.command(epilog="\b\nExamples: lslam demo\n          lslam demo --no-browser --out tour")
 @options.path("--out", "DIR", "Folder of recording and run [default: lslam-demo].", default=Path("lslam-demo"))
-@options.flag("--no-open", "Do not open the page in a browser.")
+@options.flag("--no-browser", "Do not open the page in a browser.")
 @options.flag("--overwrite", "Replace an earlier demo in the folder.")
 @options.as_json
 @options.verbosity
-def command(out: Path, no_open: bool, **given: Any) -> None:
+def command(out: Path, no_browser: bool, **given: Any) -> None:
     """Simulate a small drive with a loop, run it, and open its page. A minute at the first time, when kernels are compiled.
 
     Nothing is asked and nothing is fetched. The last lines are three commands to go on with.
@@ -51,7 +51,7 @@ def command(out: Path, no_open: bool, **given: Any) -> None:
         log.info("%s", simulating.record_drive(drive, recording, given["overwrite"]).text)
         context.invoke(main_job.command, sequence=str(recording), out=folder, lidar_topic=None, **given)
     page = folder / "report.html"
-    is_open = not no_open and open_page(page)
+    is_open = not no_browser and open_page(page)
     if given["as_json"]:
         return
     where = "is open in your browser" if is_open else "is to be opened in a browser"

@@ -59,7 +59,7 @@ def test_the_page_opens_where_there_is_a_display(tmp_path: Path, monkeypatch: py
     assert opened == [(out / "run/report.html").as_uri()]
     assert "The page is open in your browser" in done.stdout
     assert f"lslam info '{out}/recording'" in done.stdout
-    shut = lslam("demo", "--out", out, "--no-open", "--overwrite", "--json")
+    shut = lslam("demo", "--out", out, "--no-browser", "--overwrite", "--json")
     assert len(opened) == 1
     assert json.loads(shut.stdout)["folder"] == str(out / "run")
 

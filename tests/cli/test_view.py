@@ -24,7 +24,9 @@ from lslam.io.formats.point_files import read_cloud
 from lslam.io.formats.trajectory_lines import write_tum
 from lslam.maps.octree import points_of
 from lslam.pipeline.map_files import MapNote, georeference_note, write_map
+from lslam.pipeline.map_tiles import write_tiles
 from lslam.pipeline.plot_run import view_run
+from lslam.pipeline.rebuild import read_run
 from lslam.pipeline.view.sites import MapTiles
 from lslam.reports.figures import MOST_POINTS, by_height
 
@@ -67,10 +69,18 @@ def test_all_is_shown_in_the_world_of_the_run(run: Path) -> None:
     assert (bare.cloud, bare.odometry) == (None, None)
 
 
+@pytest.mark.parametrize("is_tiled", [False, True])
 def test_tiles_of_a_map_in_utm_lie_in_the_world_of_the_run(
-    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_tiled: bool
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    if is_tiled:
+        (run / "tiles").mkdir()
+        write_tiles(
+            run / "tiles", ArrayCloud.of(POINTS), MapNote("drive", 0.2), 20.0, "laz", read_run(run).georeference
+        )
+        for name in ("map.laz", "map.json"):
+            (run / name).unlink()
     for _ in ("built", "from the cache"):
         tiles = MapTiles(run, [np.zeros((1, 3))])
         tiles.start()
@@ -84,7 +94,10 @@ def test_tiles_of_a_map_in_utm_lie_in_the_world_of_the_run(
         away, _ = cKDTree(points_of("r", data[:2400], tree)).query(POINTS)
         assert away.max() < 0.003
     assert tiles.node("r0") is None
-    (run / "map.laz").unlink()
+    if is_tiled:
+        (run / "tiles/map.json").unlink()
+    else:
+        (run / "map.laz").unlink()
     bare = MapTiles(run, [np.zeros((1, 3))])
     bare.start()
     bare.stop()
