@@ -95,7 +95,7 @@ def _position_fix(
 def control_residuals(
     points: Many[ControlPoint], results: Many[ScanResult], georeference: Georeference, geoid: str = ""
 ) -> list[ControlResidual]:
-    """What is left of the points at the final poses."""
+    """Residuals of the points at the final poses."""
     survey = _Survey(points, results, geoid)
     there = geodesy.to_local(survey.on_earth, georeference.origin)
     off = there - se3.apply(georeference.T_enu_world, survey.own)
@@ -153,7 +153,7 @@ def control_facts(residuals: Many[ControlResidual]) -> dict[str, float]:
 
 
 def contradicting(residuals: Many[ControlResidual], probability: float) -> list[str]:
-    """One sentence for each control point whose residual after the solution is significant; the point stays in use."""
+    """Sentence for each control point, kept in use, whose residual's chi2 lies beyond the quantile at `probability`."""
     limit = float(np.sqrt(quantile(probability, 3)))
     wrong = sorted((one for one in residuals if one.size > limit), key=lambda one: -one.size)
     texts = [

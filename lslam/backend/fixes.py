@@ -64,7 +64,7 @@ class Fixes:
 
 @dataclass(frozen=True)
 class Faults:
-    """Sentences about what is wrong, and the same for the manifest."""
+    """Faults of the fixes in sentences, and as values for the manifest."""
 
     problems: tuple[str, ...] = ()
     facts: dict[str, Any] | None = None

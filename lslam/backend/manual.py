@@ -74,7 +74,7 @@ class _Row:
         return value
 
     def size(self, *names: str) -> float | None:
-        """Likewise, of what is above zero."""
+        """A number above zero, None where the cell is empty; raises InputError for others."""
         value = self.number(*names)
         if value is not None and value <= 0:
             raise self.error(f"{names[0]} = {value:g} must be above 0")

@@ -66,7 +66,7 @@ class BackEnd:
     georeference : of the world of `results`, None when unknown
     T_final_odometry : (4, 4) from the world of odometry into that of `results`
     solution : of the graph, None where the poses are odometry's
-    control : what is left of the control points
+    control : residuals of the control points
     osm : matches of walls with buildings, None without a usable map; buildings : of that map, at their estimated places
     facts : for the manifest; problems : what failed, one sentence each
     """

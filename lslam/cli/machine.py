@@ -34,7 +34,7 @@ LIBRARIES = (
 
 
 def machine_document() -> dict[str, Any]:
-    """All parts by name, for --json; one that cannot be told is an object with `problem`."""
+    """All parts by name, for --json; one that cannot be examined is an object with `problem`."""
     parts: dict[str, Callable[[], Any]] = {
         "lslam": lambda: __version__,
         "python": lambda: sys.version.split()[0],
@@ -87,7 +87,7 @@ def _container(limit: str) -> float | None:
 
 
 def _kernels() -> dict[str, Any]:
-    """Folder of compiled kernels, its size in bytes and number of kernels."""
+    """Folder of compiled kernels, its size in bytes, number of kernels, and `is_warm`: whether there are any."""
     from lslam.core.kernels.cache import kernel_folder
 
     folder = kernel_folder()

@@ -89,7 +89,7 @@ _current: Stop | None = None
 
 
 def current() -> Stop:
-    """The one whose signals are heeded now; where nobody does, one that is never asked."""
+    """The `Stop` that handles signals now; without one, a `Stop` that never stops."""
     return _current or Stop()
 
 

@@ -205,7 +205,7 @@ class _Window:
                 return
 
     def error(self, why: str) -> json.JSONDecodeError:
-        """What is wrong here, with its place in the whole text."""
+        """Error about this place, with its position in the whole text."""
         line, column = self._place()
         error = json.JSONDecodeError(why, "", 0)
         error.args = (f"{why}: line {line + 1} column {column + 1} (char {self._passed + self._at})",)

@@ -231,7 +231,7 @@ def _rates(t: Trajectory, step: int, first: int | None = None, count: int | None
 
 
 def _correlation(a: Floats, b: Floats) -> tuple[Floats, Longs]:
-    """Pearson correlation of a shifted by lag against b, mean of the channels that vary, and the lags."""
+    """Pearson correlation of a (N, C), shifted by each lag, against b (M, C), mean of channels that vary, and the lags."""
     from scipy.signal import correlate
 
     n, m = len(a), len(b)
@@ -261,7 +261,7 @@ def _correlation(a: Floats, b: Floats) -> tuple[Floats, Longs]:
 
 
 def _refine(estimate: Trajectory, truth: Trajectory, start: int, step: int) -> tuple[int, float]:
-    """The shift within one sample of `start` at which the rates differ least, and by how much (0..1)."""
+    """Shift, ns, within `step` of `start` with least difference of rates, and that, 0..1; `start` and 1 if too short."""
     from scipy.optimize import minimize_scalar
 
     low = max(int(estimate.stamps_ns[0]), int(truth.stamps_ns[0]) - start + step)
@@ -281,7 +281,7 @@ def _refine(estimate: Trajectory, truth: Trajectory, start: int, step: int) -> t
 
 
 def _snap(estimate: Trajectory, truth: Trajectory, offset: int, step: int) -> int:
-    """Exact constant, ns, when both files have the same stamps on two clocks; else the offset as it is."""
+    """Exact constant, ns, if stamps differ by one, paired within half a `step`, ns; else `offset` unchanged."""
     stamps = estimate.stamps_ns + offset
     i, j = nearest_one_to_one(stamps, truth.stamps_ns, step // 2)
     if len(i) < LEAST_POSES:

@@ -183,7 +183,7 @@ def _at_one_place(
 
 
 def _other_unit(estimate: Floats, truth: Floats) -> list[str]:
-    """Notes, if the spreads of both trajectories differ by the ratio of two units of length."""
+    """Notes, if the spreads of poses (N, 4, 4) differ by the ratio of two units of length."""
     own, real = (float(np.linalg.norm(poses[:, :3, 3].std(axis=0))) for poses in (estimate, truth))
     if max(own, real) < LEAST_SPREAD_M or own <= 0:
         return []
@@ -196,7 +196,7 @@ def _other_unit(estimate: Floats, truth: Floats) -> list[str]:
 
 
 def _rotation_note(estimate: Floats, truth: Floats) -> list[str]:
-    """Note when the motions show that the two body frames are rotated against each other, beyond what drift explains."""
+    """Note if motions of poses (N, 4, 4) show body frames rotated against each other, beyond what drift explains."""
     turn = body_turn(estimate, truth)
     if turn is None or turn.mahalanobis2 < UNLIKELY:
         return []

@@ -293,7 +293,7 @@ def _between(finding: ExpectedFinding, result: CurveResult, *, is_highest: bool)
 
 
 def _ranking(finding: ExpectedFinding, curve: Curve, other: int, base: int, is_highest: bool) -> Ranking:
-    """Ranking of the value at index `other` against that at `base`."""
+    """Ranking of the value at index `other` against that at `base`; is_highest : larger is better."""
     if curve.loses_most[other]:
         if finding.kind == "best_between" or finding.of.endswith("efficiency"):
             return "worse"

@@ -177,10 +177,10 @@ class Cleaner:
 
     Visibility between scans, as in Pomerleau et al. (ICRA 2014) and Removert (Kim and Kim, IROS 2020), but scan against
     scan, so that neither the map nor its length has to fit into memory. The ground never moves: beams that graze it say
-    little, and only what stands on it (`things`) is asked about.
+    little, and only points of objects above it are tested.
 
     up : (3,) unit vector, up in the world of the scans
-    removed, seen : points taken out, of so many
+    removed : number of points removed; seen : of all points
     """
 
     def __init__(self, up: Floats = Z) -> None:

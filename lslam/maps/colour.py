@@ -186,7 +186,7 @@ class MapColourer:
             self._normals[a:b] = np.rint(127 * units)
 
     def _array_on_disk(self, kind: type[Any], count: int, *shape: int) -> NDArray[Any]:
-        """Array (count, *shape) of zeros in a temporary file that goes with it; room on the disk is taken at once."""
+        """Array (count, *shape) of zeros in a temporary file, deleted with it; its space is allocated at once."""
         row = np.dtype(kind).itemsize * int(np.prod(shape))
         if not count:
             return np.zeros((0, *shape), kind)

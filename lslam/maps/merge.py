@@ -228,7 +228,7 @@ class MapMerger:
 
 
 def _add_up(rows: Longs, has_tags: bool = False) -> Longs:
-    """Sum of the rows of each key, from sorted rows, with the tags of the one that comes first by them."""
+    """Sum of rows (n, k) by key, sorted by it; with `has_tags`, the tags of the row with the smallest ones."""
     if has_tags:
         rows = rows[np.lexsort((rows[:, 5], rows[:, 0]))]
     first = np.flatnonzero(np.diff(rows[:, 0], prepend=rows[0, 0] - 1))

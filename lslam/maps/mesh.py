@@ -37,7 +37,7 @@ def require_open3d() -> Any:
 def denoise(cloud: ArrayCloud, neighbours: int = NEIGHBOURS, deviations: float = DEVIATIONS) -> ArrayCloud:
     """The cloud without points far from their neighbours: Open3D's statistical outlier removal.
 
-    neighbours, deviations : a point goes when its mean distance to so many is larger than the mean of all by so many
+    neighbours, deviations : a point is removed if its mean distance to `neighbours` exceeds the mean of all by `deviations`
         standard deviations; a smaller cloud stays as it is
     """
     package = require_open3d()

@@ -164,7 +164,7 @@ class _Builder:
 
 
 def _sorted_out(records: Records, low: Floats, edge: float) -> Iterator[tuple[Records, Records, NDArray[Any]]]:
-    """Block by block: the first records of the cells of a cube, all others, and the number of the child of each of those."""
+    """Block by block: first records of the cells of a cube (`low` (3,), `edge` m), the others, and these ones' child number."""
     is_taken = np.zeros(CELLS**3, bool)
     for begin in range(0, len(records), BLOCK):
         block = np.asarray(records[begin : begin + BLOCK])

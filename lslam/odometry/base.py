@@ -20,7 +20,7 @@ from lslam.registration.result import RegistrationResult
 
 
 class Traits:
-    """What a method declares of itself; the usual values, which it inherits."""
+    """Properties of a method; those that it does not set have the default values here."""
 
     # How it deskews, in words; empty: not at all.
     deskew: str = ""

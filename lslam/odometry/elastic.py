@@ -43,7 +43,7 @@ class ElasticSweep:
 
     @classmethod
     def of(cls, prior: MotionPrior) -> ElasticSweep:
-        """Through both ends of the prior, with its bend where that was felt."""
+        """Sweep through both ends of the prior, with its course between them where an IMU measured it."""
         straight = cls(prior.poses[0], prior.poses[-1], prior.times)
         if not prior.is_bent:
             return straight
@@ -100,7 +100,7 @@ class ElasticConstraints:
 
     @classmethod
     def of_course(cls, prior: MotionPrior) -> ElasticConstraints:
-        """Of a sweep whose motion later scans told as well: the map that they made has no skew."""
+        """Constraints of a sweep whose motion is smoothed with later scans: the map that they made has no skew."""
         assert prior.change is not None
         fixed = np.eye(6) / LEAST_SKEW**2
         return cls(ElasticSweep.of(prior), NOTHING, inverse(prior.change), 0.0, np.zeros(6), fixed)
@@ -264,7 +264,7 @@ def _scale(lever: float) -> Floats:
 
 
 def _weak(H: Floats, lever: float, least: float) -> Floats:
-    """(K, 6) directions of the sweep as a whole of which H (6, 6) tells less than `needed`, rotations scaled by `lever`."""
+    """(K, 6) directions of the whole sweep about which H (6, 6) has less information than `needed`, rotations scaled by `lever`."""
     scale = _scale(lever)
     values, vectors = np.linalg.eigh(H * np.outer(scale, scale))
     return np.ascontiguousarray(vectors.T[values <= least])

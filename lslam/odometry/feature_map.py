@@ -70,7 +70,7 @@ class FeatureScan:
         return {}
 
     def matches_of(self, kind: str, count: int) -> Matches:
-        """Matches of so many edges or planar points, as the last alignment with this scan left them.
+        """Matches of `count` edges or planar points, in the state after the last alignment with this scan.
 
         They save a search wherever a point lies near where one was before, whichever alignment it belongs to.
         """
@@ -78,7 +78,7 @@ class FeatureScan:
 
 
 def no_counterparts(count: int) -> Matches:
-    """What a search of so many points begins with."""
+    """Initial state of a search for `count` points."""
     return np.full((count, 3), -1, np.int32), np.full((count, 3, 4), -1.0)
 
 

@@ -95,7 +95,7 @@ class Icp(MapMethod):
         return replace(points, covariance=self._surfaces[1])
 
     def is_elastic(self, prepared: PreparedPoints, prior: MotionPrior) -> bool:
-        """Whether both ends of a sweep can be told: by points with times, on a map, when the speed is known."""
+        """True when begin and end pose of a sweep are observable: it has point times and enough points, and there is a map."""
         is_one_pose = prepared.source_times is None or len(prior.times) < 2
         return not is_one_pose and len(self.registration.map) > 0 and len(prepared.source) >= MIN_SOURCE_POINTS
 

@@ -304,7 +304,7 @@ class Lips(Traits, Stateful):
 
 
 def _refusal(window: PlaneWindow, planes: Planes, matches: Longs) -> str:
-    """Reason to reject a scan's planes: none, or too few of their points on known planes; empty if they are accepted."""
+    """Reason to reject a scan's planes: none, or few points on known planes (`matches` (P,), -1 unknown); else empty."""
     if len(planes) == 0:
         return "no plane is seen: the IMU carries the scan"
     if len(window.landmarks) == 0:

@@ -100,7 +100,7 @@ class WindowValues:
         )
 
     def select(self, states: slice, planes: slice | Bools = slice(None)) -> WindowValues:
-        """The values of some of the states and planes."""
+        """The values of the `states` and `planes`, slices or a mask."""
         return replace(
             self,
             poses=self.poses[states],
@@ -125,7 +125,7 @@ HUBER_SIGMAS = 2.8
 
 @dataclass(frozen=True)
 class WindowPrior:
-    """What is known of the oldest state, the shared part and the planes: x^T information x / 2 + gradient x, x since `at`."""
+    """Prior of the oldest state, the shared part and the planes: x^T information x / 2 + gradient x, x since `at`."""
 
     information: Floats
     gradient: Floats

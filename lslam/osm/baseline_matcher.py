@@ -113,7 +113,7 @@ def _match(
 
 
 def _first(graph: PoseGraph, poses: Floats, count: int) -> PoseGraph:
-    """The part of the graph with the first `count` keyframes, at `poses`."""
+    """The part of the graph with the first `count` keyframes, at `poses` (K, 4, 4)."""
     return replace(
         graph,
         poses=poses[:count],

@@ -169,7 +169,7 @@ class _Line:
 
 
 def _place_views(sights: Sequence[KeyframeMatch], poses: Mapping[int, Floats]) -> list[_PlacedView]:
-    """The walls seen about each keyframe with a pose, in the map frame."""
+    """Walls seen from each keyframe with a pose in `poses`, (3,) by number, x, y (m), yaw (rad); map frame."""
     found = []
     for sight in sights:
         if sight.keyframe in poses:

@@ -207,7 +207,7 @@ class _WallSearch:
         return [match for start in starts if (match := self._refine(*start)) is not None]
 
     def _refine(self, pose: Floats, gates: Floats) -> WallMatch | None:
-        """The pose refined by lines; None when it leaves the window or no wall has a partner."""
+        """Pose (3,) refined by lines with each of `gates` (G,), m; None if it leaves the window or no wall has a partner."""
         at, config, prior = self.at, self.config, (self.at, self.trust)
         pose, normal, centre, rms, pair = wall_matching.refine(
             self.source, self.target, pose, *prior, gates, LAST_ITERATIONS, LIKENESS, SHORT, self.by_coverage

@@ -252,7 +252,7 @@ def _heights(cloud: NDArray[np.float32]) -> Floats:
 
 
 def _standing(points: Floats, height: Floats) -> NDArray[np.uint16]:
-    """SemanticKITTI classes of points above the ground: by the shape of their voxels, then by that of connected objects."""
+    """SemanticKITTI classes (N,) of points (N, 3) by their `height` (N,), m: shape of voxels, then of connected objects."""
     cells = np.floor(points / CUBE_M).astype(np.int64)
     keys, member = np.unique(_pack_cells(cells), return_inverse=True)
     is_flat, is_upright, is_rough = _shapes(points, keys, member)
@@ -276,7 +276,7 @@ def _standing(points: Floats, height: Floats) -> NDArray[np.uint16]:
 
 
 def _shapes(points: Floats, keys: Longs, member: Longs) -> tuple[Bools, Bools, Bools]:
-    """For each voxel: is its neighbourhood a plane, is that plane vertical, and has it points but no plane."""
+    """(V,) per voxel: is its neighbourhood a plane, is that plane vertical, and has it points but no plane."""
     relative = points - points.mean(0)
     moments = np.column_stack(
         [np.ones(len(points)), relative, *(relative[:, i] * relative[:, j] for i in range(3) for j in range(i, 3))]

@@ -54,7 +54,7 @@ OPEN_KEYS = (*(f"{section}.{key}" for section, keys in LENGTHS.items() for key i
 
 @dataclass(frozen=True)
 class PreparedRun:
-    """What is to be done, resolved: the scans that are used, the method, the truth and the map; `poses` are those of --poses.
+    """A run ready to start: the scans that are used, the method, the truth and the map; `poses` are those of --poses.
 
     store : the keyframes; folder, checkpoints : None for a run that stays in memory
     """

@@ -326,7 +326,7 @@ def view_prior_map(job: PreparedRun, record: RunRecord, prior_map: PriorMap) -> 
 
 
 def spread_out(way: Floats) -> Bools:
-    """Scans that tell what differs, by the way (N,) travelled, m: the first of each metre, or more of a drive of few metres."""
+    """Scans to compare with the map, by path length (N,), m: the first of each metre, or more of a drive of few metres."""
     spacing = max(min(SPACING_M, float(way[-1]) / LEAST_SCANS), 1e-9)
     return np.asarray(np.diff(np.floor(way / spacing), prepend=-1.0) > 0)
 

@@ -207,7 +207,7 @@ class Manifest:
         }
 
     def _sections(self, *names: str) -> dict[str, Any]:
-        """Copies of what is known of these; the others stay away."""
+        """Copies of the sections that are set."""
         return {name: copy(value) for name in names if (value := getattr(self, name))}
 
 

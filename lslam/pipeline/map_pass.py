@@ -283,7 +283,7 @@ class MapCheckpoints:
         return self._checkpoints.folder
 
     def begin(self, make: Callable[[], M], poses: Floats) -> tuple[M, int]:
-        """Maker in the state of an earlier pass over `poses` (N, 4, 4), and the number of scans it has done."""
+        """Maker as an earlier pass over `poses` (N, 4, 4) left it, and number of its scans; a new one, and 0, without."""
         self._poses = hashlib.sha256(np.ascontiguousarray(poses).tobytes()).hexdigest()
         latest, maker = self._checkpoints.latest(), make()
         try:

@@ -272,7 +272,7 @@ def _of_final_poses(check: MotionCheck, results: list[ScanResult]) -> MotionChec
 
 
 def _check_stamps(results: list[ScanResult], positions: Floats, stamps_ns: Longs) -> None:
-    """Warn of wrong stamps: poses follow each other steadily, but the stamps do not. No scan is lost."""
+    """Warn of wrong stamps: `positions` (N, 3) follow each other steadily, `stamps_ns` (N,) do not. No scan is lost."""
     at, off_s = stamp_faults(positions, stamps_ns)
     if at:
         log.warning(

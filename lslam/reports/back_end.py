@@ -270,7 +270,7 @@ def localization_tracks(record: RunRecord) -> tuple[list[Track], list[tuple[str,
 
 
 def changed_dots(sample: ArrayCloud | None) -> list[tuple[str, NDArray[Any]]]:
-    """Places (K, 2), m, of what is gone and what is not in the map, by style, some of each; empty where nothing is known."""
+    """Positions (K, 2), m, of objects gone and not in the map, by style, some of each; empty if unknown."""
     if sample is None or "change" not in sample.columns:
         return []
     dots = []

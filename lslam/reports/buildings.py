@@ -143,7 +143,7 @@ def _row(correction: BuildingCorrection) -> tuple[str, ...]:
 
 
 def _holds(matches: OsmMatches, poses: Floats) -> Figure:
-    """Figure of the parts of the path where the map constrained the trajectory."""
+    """Figure of the parts of the path, `poses` (K, 3), where the map constrained the trajectory."""
     at = {match.keyframe: match for match in matches.keyframes}
     used = np.array([k for k, match in at.items() if match.is_accepted], np.intp)
     kinds = [
@@ -183,7 +183,7 @@ def _outlines(buildings: Iterable[Building]) -> list[Floats]:
 
 
 def _parts(lines: list[Floats]) -> list[Floats]:
-    """Pieces of a line that is broken by NaN, short enough to be drawn without thinning."""
+    """Pieces of a line (N, 2) that is broken by NaN, short enough to be drawn without thinning."""
     gap = np.full((1, 2), np.nan)
     parts: list[list[Floats]] = [[]]
     size = 0

@@ -155,7 +155,7 @@ def pack_points(points: NDArray[np.floating]) -> dict[str, Any]:
 
 
 def _spacing(points: Floats) -> float:
-    """Median distance, m, from some of the points to the nearest other one; 0 for one point."""
+    """Median distance, m, from some of the points (M, 3) to the nearest other one; 0 for one point."""
     from scipy.spatial import cKDTree
 
     if len(points) < 2:

@@ -140,7 +140,7 @@ def data_uri(png: bytes) -> str:
 
 
 def _levels(image: NDArray[np.float32], top: float | None) -> NDArray[np.uint8]:
-    """Grey levels of a count image on a logarithmic scale; `top` counts, by default the 99.5 % quantile, are white."""
+    """Grey levels (H, W) of counts, on a logarithmic scale; `top` counts, by default the 99.5 % quantile, are white."""
     occupied = image[image > 0]
     if not len(occupied):
         return np.zeros(image.shape, np.uint8)

@@ -101,7 +101,7 @@ class Frame:
         self.add(_text(x, y, text, anchor, style))
 
     def polyline(self, x: NDArray[Any], y: NDArray[Any], style: str) -> None:
-        """A line, broken where a value is not finite; a single point becomes a dot."""
+        """Add a line of x, y (N,), broken where a value is not finite; a single point becomes a dot."""
         px, py = self.px(x), self.py(y)
         for run in finite_runs(px + py):
             if run.stop - run.start == 1:
@@ -147,7 +147,7 @@ def _text(x: float, y: float, text: str, anchor: str, style: str) -> str:
 
 
 def ticks(low: float, high: float, count: int = 5, whole: bool = False) -> list[float]:
-    """Round values (1, 2, 2.5 or 5 times a power of ten) inside [low, high], about `count` of them.
+    """Round values (1, 2, 2.5 or 5 times a power of ten) inside [low, high], about `count` of them; whole : only integers.
 
     >>> ticks(0.0, 1.0)
     [0.0, 0.2, 0.4, 0.6, 0.8, 1.0]
@@ -341,7 +341,7 @@ def _fit_frame(x_span: tuple[float, float], y_span: tuple[float, float], width: 
 
 
 def _mark_ends(frame: Frame, xy: Floats) -> None:
-    """Draw a circle at the start of the path and a square at its end; on a closed loop the circle is on top."""
+    """Draw a circle at the start of the path (N, 2) and a square at its end; on a closed loop the circle is on top."""
     finite = xy[np.isfinite(xy).all(1)]
     if not len(finite):
         return

@@ -262,7 +262,7 @@ def lot(front: Floats, tangent: Floats, width: float, depth: float) -> Floats:
 
 
 def _add_front_garden(site: StreetSite, width: float, setback: float, front: Floats, yaw: float) -> None:
-    """Add a hedge or a low wall between garden and pavement."""
+    """Perhaps add a hedge or low wall on a plot of `width` m, `setback` m before the house's front (2,), m, at `yaw`."""
     rng = site.rng
     kind = rng.random()
     if kind > site.layout.gardens:

@@ -94,7 +94,7 @@ def build_corridor(street: RouteCurve, terrain: Terrain, layout: Layout, rng: np
 
 
 def _fill_opening(site: StreetSite, s: float, side: int) -> tuple[Floats, float]:
-    """Add a house behind an opening, and lamps, a cabinet, two trees before it; returns its outline and height."""
+    """Add a house behind an opening at `s` m, side 1 or -1, and lamps, a cabinet, two trees; returns outline and height."""
     layout, rng = site.layout, site.rng
     for lamp in (s + rng.uniform(-12, -6), s + rng.uniform(6, 12)):
         _add_box(site, lamp, side * layout.band, [-0.08, -0.08, -0.3], [0.08, 0.08, 7.0], Surface.POLE)
@@ -202,7 +202,7 @@ def build_woods(street: RouteCurve, terrain: Terrain, layout: Layout, rng: np.ra
 
 
 def _add_trees(site: StreetSite, way: Floats, outlines: list[Floats]) -> None:
-    """Add random trees and bushes, denser near the path, none on it or in a house."""
+    """Add random trees and bushes, denser near the path `way` (N, 2), m, none on it or in `outlines` of houses."""
     from scipy.spatial import cKDTree
 
     layout, rng, length = site.layout, site.rng, site.street.length
@@ -246,7 +246,7 @@ def _add_objects(site: StreetSite) -> None:
 
 
 def _add_lodges(site: StreetSite, way: Floats) -> Houses:
-    """Add a few houses, clear of every bend of the path. Returns outlines and heights."""
+    """Add a few houses, clear of every bend of the path (N, 2), m. Returns outlines and heights."""
     layout, rng, length = site.layout, site.rng, site.street.length
     houses: Houses = []
     for s in np.arange(0.5 * LODGES, length, LODGES):
@@ -289,7 +289,7 @@ def build_carpark(
 
 
 def _add_bumps(site: StreetSite, low: Floats, high: Floats, roughness: float) -> None:
-    """Add ground without holes, with random bumps. Raises UsageError where it would be too large."""
+    """Add ground from `low` to `high` (2,), m, with random bumps. Raises UsageError where it would be too large."""
     x, y = (_grid_lines(float(low[k]), float(high[k])) for k in (0, 1))
     if len(x) * len(y) > MOST_BUMPS:
         raise UsageError(

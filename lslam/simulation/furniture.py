@@ -210,7 +210,7 @@ def house(rng: np.random.Generator, width: float, depth: float, storeys: tuple[i
 def _facade(
     builder: MeshBuilder, rng: np.random.Generator, style: _HouseStyle, start: Floats, end: Floats, street: bool
 ) -> None:
-    """Add a wall from `start` to `end` (2,), its outside to the right, with a grid of windows."""
+    """Add a wall from `start` to `end` (2,), m, its outside to the right, with a grid of windows; street : with a door."""
     length = float(portable.norm(end - start))
     along = (end - start) / length
     outward = np.array([along[1], -along[0]])
@@ -261,7 +261,7 @@ def _facade(
 
 
 def _balcony(builder: MeshBuilder, middle: Floats, along: Floats, outward: Floats, floor: float, reach: float) -> None:
-    """Add a slab with a parapet on three sides."""
+    """Add a slab with a parapet, 2.2 m wide along unit `along`, `reach` m to `outward`, from `middle` (2,); floor : height, m."""
     a, b = middle - 1.1 * along, middle + 1.1 * along
     c, d = b + reach * outward, a + reach * outward
     top = floor + 0.95
@@ -310,7 +310,7 @@ def _flat_roof(builder: MeshBuilder, width: float, depth: float, eaves: float) -
 
 
 def _porch(builder: MeshBuilder, rng: np.random.Generator, width: float) -> None:
-    """Add nothing, a porch with steps, or a bay as high as the ground floor, in front of the facade."""
+    """Add nothing, a porch with steps, or a bay as high as the ground floor, before a facade `width` m wide."""
     kind, u = rng.random(), rng.uniform(-0.3, 0.3) * width
     if kind < 0.3:
         builder.add_box([u - 1.0, -1.2, 2.5], [u + 1.0, 0.05, 2.65], Surface.ROOF)

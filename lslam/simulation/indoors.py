@@ -114,7 +114,7 @@ def _add_shelves(builder: MeshBuilder, rng: np.random.Generator) -> None:
 
 
 def _add_table(builder: MeshBuilder, middle: Floats, rng: np.random.Generator) -> None:
-    """Add a table on four legs, with objects on it."""
+    """Add a table on four legs at `middle` (2,), m, with objects on it."""
     half, top = np.array(TABLE[:2]) / 2, TABLE[2]
     builder.add_box([*(middle - half), top - 0.03], [*(middle + half), top], Surface.FENCE)
     for corner in ((-1, -1), (-1, 1), (1, -1), (1, 1)):

@@ -144,7 +144,7 @@ class Meeting:
 
 
 def _meet_bodies(bodies: Sequence[MovingMesh], rays: Rays, rings: int, hits: Hits, stamp: float) -> None:
-    """Replace `hits` by hits on moving bodies where these are closer; `stamp`, s, is that of the bodies' centres."""
+    """Replace `hits` by closer ones on bodies, posed at `stamp`, s; rings : of a whole scan, rays column after column; else 1."""
     centres = np.stack([body.centre for body in bodies])
     lasting = float(rays.times.max()) - stamp
     # Body and LiDAR both move while the sweep lasts; a millimetre for the rounding.

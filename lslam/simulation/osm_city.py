@@ -132,7 +132,7 @@ def _add_ground(
 
 
 def _furnish(site: StreetSite, network: Network, outlines: list[tuple[Floats, float]]) -> None:
-    """Add roads with kerbs, and beside them cars, trees, poles and bins wherever no building is in the way."""
+    """Add roads with kerbs, and beside them cars, trees, poles and bins; outlines : (N, 2), m, of houses, and heights."""
     sites = [site.along(street) for street in network.streets]
     for road in sites:
         add_road(road, network.distance)

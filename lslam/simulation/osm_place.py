@@ -150,7 +150,7 @@ def keep_out_of_walls(movers: list[Mover], city: OsmCity, duration: float) -> li
 
 
 def _along_streets(scenario: Scenario, extract: MapExtract, margin: float) -> Route:
-    """Path along the longest street, in its right lane; raises UsageError if there is none."""
+    """Path along the longest street, in its right lane, `margin` m from houses; raises UsageError if there is none."""
     lane, kinds = scenario.path.lane, WALKABLE if scenario.carrier == "walker" else DRIVABLE
     radius = TIGHTEST[scenario.carrier] + lane + 1.0
     if scenario.carrier == "drone":

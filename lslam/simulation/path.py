@@ -93,7 +93,7 @@ class VehiclePath:
 def drive(
     curve: RouteCurve, terrain: Terrain, speed: SpeedProfile, distance: float, height: float, shaking: Swing
 ) -> VehiclePath:
-    """Path along `distance` m of `curve`, in laps on a closed one, by the speed profile."""
+    """Path along `distance` m of `curve`, in laps on a closed one, by the speed profile; height : of the LiDAR, m."""
     s = np.linspace(0, distance, int(np.ceil(distance / 0.25)) + 1)
     v = _speeds(curve, s, speed)
     t = np.concatenate([[0.0], np.cumsum(2 * np.diff(s) / (v[:-1] + v[1:]))])
@@ -103,7 +103,7 @@ def drive(
 
 
 def _speeds(curve: RouteCurve, s: Floats, speed: SpeedProfile) -> Floats:
-    """Speed at each distance, m/s: cruising, lower in bends, with bounded acceleration and braking."""
+    """Speed at each distance s (N,), m, in m/s: `speed`, lower in bends, with bounded acceleration and braking."""
     bend = np.maximum(np.abs(curve.curvature(s)), 1e-9)
     v = np.minimum(speed.cruise, np.sqrt(speed.lateral / bend))
     step, half = s[1] - s[0], speed.easing / 2
@@ -239,7 +239,7 @@ def fly(
     swing: Swing,
     terrain: Terrain | None = None,
 ) -> FreePath:
-    """Path along `distance` m of `curve`; on a climb the speed counts along its mean slope."""
+    """Path along `distance` m of `curve`; speed counts along its mean slope. bank : share of the tilt that balances a turn."""
     rise = float(climb(curve.length) - climb(0.0))
     level = curve.length / float(portable.hypot(curve.length, rise))
     pace = replace(speed, cruise=speed.cruise * level, start=speed.start * level)

@@ -62,7 +62,7 @@ def _extent(city: City, line: Floats) -> tuple[Floats, Floats]:
 
 
 def _view(scene: RayScene, low: Floats, high: Floats, pixel: float) -> tuple[Image, tuple[Surface, ...]]:
-    """Image of the scene from above, lit from the north-west, row 0 at the north; and the visible surfaces."""
+    """Image from above of `low` to `high` (2,), m, in pixels of `pixel` m, lit from the north-west; and its surfaces."""
     width, height = (int(n) for n in np.ceil((high - low) / pixel))
     image = np.full((height, width, 3), 255, np.uint8)
     x = (low[0] + (np.arange(width) + 0.5) * pixel).astype(np.float32)

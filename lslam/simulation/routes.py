@@ -124,7 +124,7 @@ def own_route(scenario: Scenario, rng: np.random.Generator, scans: int | None = 
 
 
 def given_route(scenario: Scenario, way_points: WayPoints) -> Route:
-    """Path through way-points, m, unscaled, and a street on its left."""
+    """Path through way-points (N, 2), m, unscaled, and a street on its left."""
     points = way_points.points
     line = smooth_curve(points[:, :2], way_points.closed, scenario.path.smoothing)
     street = beside(line, scenario.path.lane)
@@ -265,7 +265,7 @@ def _is_number(text: str) -> bool:
 
 
 def _from_geojson(path: Path, origin: NDArray[Any] | None) -> WayPoints:
-    """Way-points of the only line or polygon of a GeoJSON file, m from `origin` or the first point; raises InputError."""
+    """Way-points (N, 2), m from `origin` or the first, of a GeoJSON's only line or polygon; raises InputError."""
     try:
         tree = parse_json(_text(path))
     except ValueError as error:
@@ -330,7 +330,7 @@ def _array(path: Path, values: Any) -> Floats:
 
 
 def _require_usable(path: Path, way_points: WayPoints) -> WayPoints:
-    """Way-points unchanged. Raises InputError if they are too few, too close or too short."""
+    """Way-points (N, 2) unchanged. Raises InputError if they are too few, too close or too short."""
     points = way_points.points
     ring = np.concatenate([points, points[:1]]) if way_points.closed else points
     steps = np.linalg.norm(np.diff(ring[:, :2], axis=0), axis=1)

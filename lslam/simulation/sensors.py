@@ -128,7 +128,7 @@ def _errors(model: GnssModel, count: int, rng: np.random.Generator) -> Floats:
 
 @dataclass(frozen=True)
 class WheelModel:
-    """Speed and yaw rate as a car's bus tells them.
+    """Errors of speed and yaw rate as a car's bus has them.
 
     scale : largest error of the scale, drawn evenly; yaw_scale : likewise of the yaw rate; yaw_offset : one sigma, rad/s
     noise, yaw_noise : one sigma of a reading, m/s and rad/s; step : of a speed, m/s, as pulses are counted
@@ -181,7 +181,7 @@ def simulate_wheels(
 
 
 def _slip(model: WheelModel, times: Floats, end: float, rng: np.random.Generator) -> Floats:
-    """(M,) relative excess of the wheels' speed at `times` (M,), s: half sines at random intervals."""
+    """(M,) relative excess of the wheels' speed at `times` (M,), s: half sines at random intervals until `end`, s."""
     slip = np.zeros(len(times))
     begin = float(rng.exponential(model.every))
     while begin < end:
@@ -288,7 +288,7 @@ def write_truth(folder: Path, motion: Motion, scan_stamps_ns: Longs, end: float,
 
 
 def _write_world(path: Path, T_enu_world: Floats, origin: Floats) -> None:
-    """Write world.toml: origin, T_enu_world and the gravity vector in the world."""
+    """Write world.toml: origin (lat, lon, height), T_enu_world (4, 4) and the gravity vector in the world."""
     down = np.array([0.0, 0.0, -GRAVITY])
     tree = {
         "origin_lat_lon_alt": origin.tolist(),

@@ -266,7 +266,7 @@ def _cells(plan: Plan, progress: StudyProgress) -> list[Cell]:
 
 
 def _scene(plan: Plan, subject: Subject) -> Scene:
-    """What is simulated of a scenario; raises UsageError when it ends before the scans that are used."""
+    """Scene simulated of a scenario; raises UsageError when it ends before the scans that are used."""
     assert subject.scenario is not None
     needed = count_scans([with_range(v.config, subject.range).input for v in plan.variants])
     return fit_scene(Scene(subject.scenario), needed, subject.range, plan.seeds)

@@ -78,7 +78,7 @@ class _Group:
 
 
 def extrapolate(jobs: Sequence[Job], rest: Sequence[Job], variants: dict[str, Variant], at_once: int) -> Guess | None:
-    """Time for the `rest` of a study's `jobs`, s, from the times of its finished runs; None without any.
+    """Time for the `rest` of a study's `jobs`, s, `at_once` in parallel, from times of finished runs; None without any.
 
     A run is expected to last as long as the mean of its sequence and method, or of all runs where none of these is finished.
     """

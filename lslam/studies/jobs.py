@@ -152,7 +152,7 @@ class Local:
 
 
 def _pool(most_at_once: int, count: int, is_persistent: bool = False, tries: int = 1) -> WorkerPool:
-    """Worker pool for `count` runs, of at most `most_at_once` at once and no more than there are cores."""
+    """Pool for `count` runs, at most `most_at_once` and the cores at once; tries : per run; is_persistent : workers stay."""
     cores = os.cpu_count() or 1
     at_once = max(1, min(most_at_once, cores, count))
     if most_at_once > cores:

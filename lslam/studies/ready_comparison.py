@@ -260,7 +260,7 @@ class ReadyComparison(Section):
         return Table("of which the thesis prints no number", header, tuple(rows), self.further)
 
     def _of(self, sequence: str, method: str) -> list[tuple[Of, float, str]]:
-        """What is printed of a method on a drive, or on the clean twin of a hard one: quantity, number, source."""
+        """Numbers printed of a method on a drive, or on the clean twin of a hard one: quantity, number, source."""
         plain, system = sequence.removesuffix(HARD), method.split(ON)[0]
         return [(p.of, p.values[system], p.source) for p in self.numbers if p.sequence == plain and system in p.values]
 

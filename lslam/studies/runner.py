@@ -126,7 +126,7 @@ def _hire(pool: WorkerPool) -> _Worker:
 
 
 def _ending(worker: _Worker, output: Path, is_persistent: bool) -> str | None:
-    """None when the process is ready for more, else the cause of its death; empty when it ended normally."""
+    """None if the process is persistent and ready for more, else the cause of its death, empty for a normal end."""
     try:
         worker.pipe.recv()
         if is_persistent:

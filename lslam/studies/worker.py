@@ -70,7 +70,7 @@ def size_of(scan: Scan) -> int:
 
 
 class CachedSequence(SequenceView):
-    """A whole sequence whose scans come from a store; `number` tells it from the others there."""
+    """A whole sequence whose scans come from a store; `number` distinguishes it from others there."""
 
     def __init__(self, whole: Sequence, store: ScanStore, number: int) -> None:
         super().__init__(whole, notes=list(whole.notes), problems=list(whole.problems))

@@ -116,7 +116,7 @@ def _between_keyframes(fix: PositionFix, model: Any) -> Any:
 def planar(prior: PlanarPrior, pose: Floats, key: int, scale: float = 1.0, kernel: Any = None) -> Any:
     """A planar prior on a keyframe in the map `key`: height, roll, pitch and directions that walls do not observe stay free.
 
-    pose : (4, 4) of the keyframe now, at whose height and tilt the error is linearised
+    pose : (4, 4) of the keyframe now, at whose height and tilt the error is linearised; scale : on the covariance
     """
     import gtsam
 
@@ -181,7 +181,7 @@ def _relative(graph: PoseGraph, with_lidar: bool) -> list[Any]:
 
 
 def _start(graph: PoseGraph, may_tilt: bool) -> Any:
-    """Prior factor on the first pose: tight if the graph is anchored there, wide if fixes define its frame."""
+    """Prior on the first pose, tight if the graph is anchored, wide if fixes define its frame; may_tilt : wide in tilt."""
     import gtsam
 
     sigma_m, sigma_rad = HELD if graph.is_anchored else FREE

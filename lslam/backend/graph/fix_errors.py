@@ -146,6 +146,7 @@ def actual_sigmas(seconds: Floats, residuals: Floats, sigmas: Floats, probabilit
     """(3,) ratios of the actual to the stated sigma per axis, at least 1; None where the statement holds for all.
 
     seconds : (F,) ascending; residuals : (F, 3) m, fixes minus trajectory, roughly aligned; sigmas : (F, 3) m, stated
+    probability : of the test, below 1
 
     Differences of successive fixes contain no drift of odometry: if they scatter by more than is stated, the statement is
     wrong, and the sigma is that of the scatter within half a minute.

@@ -183,7 +183,7 @@ def selected_inverse(net: Any, targets: Iterable[int]) -> Iterator[tuple[int, Fl
 
 
 def _family(keys: list[int], above: _Family, own: Floats, cross: Floats, parents: Floats) -> _Family:
-    """An unknown of covariance `own` (d, d) with its parents of `parents` (p, p), `cross` (d, p) between them."""
+    """Family of an unknown and its parents (`keys`, its own first); covariances own (d, d), parents (p, p), cross (d, p)."""
     begin = len(own)
     rows = {keys[0]: range(begin)}
     for key in keys[1:]:

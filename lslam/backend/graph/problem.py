@@ -121,7 +121,7 @@ class PoseGraph:
     spread : (K, 6, 6) covariances of poses to be added to those of `Solution`; None for nothing
     estimated_drift : the drift that odometry was corrected by
     fix_noise : correlated noise of the fixes, None where they are independent
-    inertial : the IMU between keyframes, which tells up in place of the `ups` of those it levels; None for none
+    inertial : the IMU between keyframes, which replaces the `ups` of those it levels; None for none
     """
 
     poses: Floats
@@ -152,7 +152,7 @@ class PoseGraph:
 
     @property
     def free_ups(self) -> Sequence[UpDirection]:
-        """The up directions that the IMU between keyframes does not tell already."""
+        """The up directions of keyframes that no IMU factor levels."""
         level = frozenset[int]() if self.inertial is None else self.inertial.level
         return [up for up in self.ups if up.keyframe not in level]
 

@@ -35,7 +35,7 @@ def cell_of(x: float, y: float, R: Floats, size: int, edge: float) -> tuple[int,
 
 @inline
 def mark(points: Floats, R: Floats, edge: float, visible: Image) -> None:
-    """Set the cells (S, S) of the points (N, k), rotated by R (2, 2), and those round them, to 1."""
+    """Set cells (S, S) of `edge` m at the points (N, k), rotated by R (2, 2), and those round them, to 1."""
     size = len(visible)
     for i in range(len(points)):
         row, column = cell_of(points[i, 0], points[i, 1], R, size, edge)

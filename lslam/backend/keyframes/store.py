@@ -217,7 +217,7 @@ def _unpack(arrays: dict[str, NDArray[Any]], name: str) -> dict[str, NDArray[Any
 
 
 def keyframe_arrays(keyframes: Sequence[Keyframe]) -> dict[str, NDArray[Any]]:
-    """Keyframes as arrays; a missing covariance is NaN."""
+    """Arrays of keyframes: scans, stamps_ns, poses (K, 4, 4), covariances (NaN if missing), distances, m."""
     none = np.full((6, 6), np.nan)
     return {
         "scans": np.array([k.scan for k in keyframes], np.int64),

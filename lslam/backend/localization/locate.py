@@ -58,7 +58,7 @@ NEAR_M = 20.0
 
 @dataclass(frozen=True)
 class StartPrior:
-    """What is known of the first scan beforehand, level axes of the map.
+    """Prior of the first scan's pose, level axes of the map.
 
     position : (2,) m; heading : rad, None when unknown; radius, turn : m and rad, by which both may be wrong
     """
@@ -93,7 +93,7 @@ class Start:
 
     @property
     def has_agreement(self) -> bool:
-        """Whether several keyframes say so."""
+        """True when several keyframes vote for the start."""
         return self.votes >= AGREEING_STARTS
 
     @property
@@ -201,7 +201,7 @@ class PlaceFinder:
         return GATE_SIGMAS * 0.01 * c.drift_percent * way + 0.5 * turn * way, float(turn)
 
     def _same(self, one: Vote, other: Vote) -> bool:
-        """Whether two votes put the drive at the same place, as far as odometry can tell.
+        """True when two votes agree on the start of the drive within odometry's uncertainty.
 
         Where it drifts by more than lies between two guesses, agreement is no evidence.
         """

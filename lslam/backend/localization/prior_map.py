@@ -180,7 +180,7 @@ GUESSES_APART_M, CLOSE_LOOKS, GUESSES = 6.0, 40, 10
 
 @dataclass(frozen=True)
 class Region:
-    """What is known of a position beforehand: about `centre` (2,) within `radius`, m; heading within `turn` of `yaw`, rad."""
+    """Prior of a position: about `centre` (2,) within `radius`, m; heading within `turn` of `yaw`, rad."""
 
     centre: Floats
     radius: float
@@ -189,7 +189,7 @@ class Region:
 
 
 class PlaceSearch:
-    """The whole map as coarse and fine images, and as Gaussian voxels for the verification of what is found in it."""
+    """The whole map as coarse and fine images, and as Gaussian voxels for the verification of candidates."""
 
     def __init__(self, prior_map: PriorMap, config: RegistrationConfig) -> None:
         from scipy import fft
@@ -341,7 +341,7 @@ def _centre(image: Image, cover: Image) -> Image:
 
 
 def _turned_back(cells: Longs, quarters: int, size: int) -> Longs:
-    """Flat cells of a correlation with the shifts of `cells` turned back by so many quarters of a circle."""
+    """Flat cells of a correlation with the shifts of `cells` rotated back by `quarters` of a circle."""
     r, c = np.divmod(cells, size)
     r, c = ((r, c), (c, -r), (-r, -c), (-c, r))[quarters]
     return np.asarray((r % size) * size + c % size)

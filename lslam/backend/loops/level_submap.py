@@ -166,7 +166,7 @@ class BevGrid:
         return lowest
 
     def shifts(self, cells: Longs) -> Floats:
-        """(K, 2) m that the flat cells (K,) of a correlation stand for."""
+        """Shifts (K, 2), m, of the flat cells (K,) of a correlation."""
         along = self._along()
         return np.column_stack([along[part] for part in np.divmod(cells, self.size)])
 
@@ -177,7 +177,7 @@ class BevGrid:
         return np.flatnonzero(away2 <= max(radius, self.cell) ** 2)
 
     def _along(self) -> Floats:
-        """(size,) m that row or column k of a correlation stands for."""
+        """Shift (size,), m, of row or column k of a correlation."""
         return np.asarray(np.fft.fftfreq(self.size, 1 / (self.size * self.cell)))
 
 

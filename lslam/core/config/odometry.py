@@ -141,7 +141,7 @@ NO_RECOVERY = RecoveryConfig(
 
 
 def rest_alone(recovery: RecoveryConfig) -> RecoveryConfig:
-    """No policy but `at_rest`, as configured: of a filter, whose IMU cannot tell standing from a steady motion."""
+    """No policy but `at_rest`, as configured: for a filter, whose IMU measures the same at rest and in steady motion."""
     return NO_RECOVERY.model_copy(update={"at_rest": recovery.at_rest})
 
 

@@ -201,7 +201,7 @@ class StudySequence(ScanRange):
 
 
 class StudyConfig(Section):
-    """What is run: sequences x seeds x methods x points of the parameters, and methods beside at their own values."""
+    """Runs of a study: sequences x seeds x methods x points of the parameters, and methods beside at their own values."""
 
     name: str = Field(min_length=1, pattern=r"^[\w.+ -]+$", description="of the study and its folder")
     summary: str = Field("", description="what is studied, in a line")

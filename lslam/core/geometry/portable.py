@@ -252,7 +252,7 @@ def sine_cosine_of(x: float) -> tuple[float, float]:
 
 
 def _reduce(x: Any, turns: Any) -> tuple[Any, Any]:
-    """What is left of angles after quarter turns, as the sum of two numbers."""
+    """Remainder of angles, rad, after quarter turns, as the sum of two numbers."""
     left = x - turns * _HALF_PI[0]
     step = turns * _HALF_PI[1]
     r = left - step

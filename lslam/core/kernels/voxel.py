@@ -65,7 +65,7 @@ def gate(
 ) -> NDArray[np.int64]:
     """Indices of the points that are finite, not zero, inside the range gate and outside the ego box.
 
-    `box` is x_min, x_max, y_min, y_max, z_min, z_max, or empty.
+    is_cylinder : ranges are horizontal; `box` is x_min, x_max, y_min, y_max, z_min, z_max, or empty.
     """
     kept = np.empty(len(points), np.int64)
     count = 0
@@ -227,7 +227,7 @@ def centroids(
 def means(
     points: NDArray[np.float32], times: NDArray[np.float32], size: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int32]]:
-    """Centroids like `centroids`, without the scatter: (M, 3) float32, mean time (M,), count (M,), with the same bits."""
+    """Centroids in voxels of `size`, m, like `centroids`: (M, 3) float32, mean time (M,), count (M,), with the same bits."""
     n = len(points)
     table = np.empty(table_size(n), np.int32)
     table[:] = -1

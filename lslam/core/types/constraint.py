@@ -161,7 +161,7 @@ class KnownPair:
 
 @dataclass(frozen=True)
 class ControlResidual:
-    """What is left of a control point.
+    """Residual of a control point.
 
     residual : (3,) m, east, north, up, surveyed minus solved; place : (3,) as surveyed, lat, lon (deg), height (m), WGS84
     """

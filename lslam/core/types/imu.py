@@ -161,7 +161,7 @@ class SmootherNoise:
 
 @dataclass(frozen=True)
 class InertialState:
-    """An IMU in the world at one instant, with what is wrong with it.
+    """State of an IMU in the world at one instant, with its biases and errors.
 
     T_world_imu : (4, 4); velocity, gravity : (3,) world axes, m/s and m/s2, gravity downwards
     accel_bias, gyro_bias : (3,) IMU axes, m/s2 and rad/s
@@ -220,7 +220,7 @@ class InertialChain:
 
     @property
     def level(self) -> frozenset[int]:
-        """The keyframes whose tilt the IMU tells.
+        """Keyframes whose tilt is observable by the IMU.
 
         A link by itself tells of none: the velocities at its ends are free, and take up whatever gravity is said to be.
         """
@@ -239,7 +239,7 @@ class WheelStream:
     """Speeds of a vehicle by its wheels.
 
     stamps_ns : (M,) int64, increasing; speed : (M,) m/s, forwards; yaw_rate : (M,) rad/s, None where it was not measured
-    T_lidar_base : (4, 4) the frame of which they are the speeds, x forward and z up; None where nothing says where it sits
+    T_lidar_base : (4, 4) the frame of which they are the speeds, x forward and z up; None where its mounting is unknown
     """
 
     stamps_ns: Longs

@@ -21,7 +21,7 @@ class MotionPrior:
         the motion model has none
     link : what joins the scan to the one before in a smoother; None where the motion model is for none
     has_imu_motion : an IMU measured the motion within the sweep
-    change : (6, 6) covariance of the motion from begin to end, world axes, which later scans told as well; None elsewhere
+    change : (6, 6) covariance of the motion from begin to end, world axes, smoothed with later scans; None elsewhere
     """
 
     times: Floats

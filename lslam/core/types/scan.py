@@ -20,7 +20,7 @@ NO_RING = 65535
 
 
 def has_return(points: NDArray[Any]) -> Bools:
-    """(N,) whether points (N, 3), m, are somewhere a LiDAR sees: NaN, zeros and numbers beyond reason stand for no return."""
+    """(N,) whether points (N, 3), m, are returns: NaN, zeros and unreasonably large numbers are none."""
     with np.errstate(invalid="ignore"):
         return np.asarray((np.abs(points) < FARTHEST_M).all(axis=1) & (points != 0).any(axis=1))
 

@@ -112,7 +112,7 @@ class MotionCheck:
 
     @property
     def is_open(self) -> bool:
-        """Whether the scans do not tell the motion, or tell it only along some directions."""
+        """True when the scans observe the motion not at all, or only along some directions."""
         return not self.is_conclusive or float(np.max(self.sigma[:3])) > OPEN_M
 
     @property
@@ -192,7 +192,7 @@ class ScanResult:
 
     @property
     def at_stamp(self) -> ScanResult:
-        """The result with the pose that the next scan tells; for what keeps no points as `T_world_lidar` saw them."""
+        """The result with the pose corrected by `stamp_offset`; for uses without points deskewed at `T_world_lidar`."""
         if self.stamp_offset is None:
             return self
         return replace(self, T_world_lidar=self.T_world_lidar @ self.stamp_offset, stamp_offset=None)

@@ -194,7 +194,7 @@ def _rows_with_raw_bytes(header: _Header, body: bytes) -> tuple[Floats, set[int]
 
 
 def _matches(line: re.Pattern[bytes], body: bytes, count: int) -> list[tuple[bytes, ...]]:
-    """Groups of the pattern `line` in consecutive lines, up to the first that does not match."""
+    """Groups of the pattern `line` in at most `count` consecutive lines, up to the first that does not match."""
     rows: list[tuple[bytes, ...]] = []
     position = 0
     while len(rows) < count and (match := line.match(body, position)):

@@ -57,7 +57,7 @@ def decode_pointcloud2(message: Any, where: Path) -> PointCloud:
 
 
 def decode_livox(data: bytes, start: int, is_ros1: bool, order: str, where: Path) -> tuple[PointCloud, int]:
-    """Decode a Livox CustomMsg whose header ends at `start`: points, and `timebase`, ns. Raises InputError when it is cut off."""
+    """Points of a Livox CustomMsg of ROS 1 or 2, whose header ends at `start`, and `timebase`, ns; InputError if cut off."""
     at = _livox_body(start, is_ros1)
     try:
         timebase = int(np.frombuffer(data, f"{order}u8", 1, at)[0])
@@ -166,7 +166,7 @@ def maker_by_bytes(data: bytes, size: int) -> str:
 
 
 def maker_by_name(*names: str) -> str:
-    """Maker by the names of a topic and its type; empty where they do not tell."""
+    """Maker by the names of a topic and its type; empty if unclear."""
     text = " ".join(names).lower()
     return next((maker for maker, words in _WORDS.items() if re.search(words, text)), "")
 

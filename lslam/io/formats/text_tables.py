@@ -61,7 +61,7 @@ class TextTable:
         return InputError(f"{self.path}, line {self.rows[k].number}: {what}")
 
     def numbers(self, column: int) -> Floats:
-        """(N,) float64 of a column, dates in seconds, NaN for what is no number or not there."""
+        """(N,) float64 of a column, dates in seconds, NaN for missing cells and texts."""
         cells = (row.cells[column] if column < len(row.cells) else "" for row in self.rows)
         return np.array([_number(cell) for cell in cells], np.float64)
 
@@ -270,7 +270,7 @@ def date_to_ns(text: str) -> int | None:
 
 
 def is_unix_time(first_ns: int) -> bool:
-    """Whether a clock whose earliest stamp is `first_ns` tells Unix time."""
+    """True when a clock whose earliest stamp is `first_ns` can be Unix time."""
     return first_ns >= _FIRST_NS
 
 

@@ -93,7 +93,7 @@ class Blocks:
 
 
 def split_blocks(packets: NDArray[np.uint8], azimuth: Longs, times_ns: Longs, model: VelodyneModel) -> Blocks:
-    """Blocks of `packets` (P, 1206); azimuth, times_ns : (P,) unwrapped azimuth and time of each packet's first block.
+    """Blocks of `packets` (P, 1206); azimuth (P,), 0.01 deg, unwrapped, and times_ns (P,), of each packet's first block.
 
     With two returns per shot only the last is used, the first of each pair of blocks.
     """

@@ -269,7 +269,7 @@ def _intervals(across: NDArray[Any], steps: Stamps, period: float) -> Stamps:
 
 
 def _offsets(offset: Stamps, ahead: Stamps, limit: float) -> Stamps:
-    """Clock offset of each message, ns, relative to the clock nearest to the witness that stamps enough messages."""
+    """Clock offset of each message, ns, relative to the clock, of those with many messages, that is nearest to recording."""
     order = np.argsort(offset, kind="stable")
     clocks = np.split(order, np.flatnonzero(np.diff(offset[order]) > 0.5 * limit) + 1)
     levels = offset[[int(clock[len(clock) // 2]) for clock in clocks]]

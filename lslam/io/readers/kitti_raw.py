@@ -160,7 +160,7 @@ def _oxts(folder: Folder) -> Oxts | None:
 
 
 def _stamps(folder: Folder, oxts: Oxts | None, is_extract: bool) -> tuple[Longs, float, float | None]:
-    """Stamps of the LiDAR, else of OXTS by index, else nominal; the rate, Hz; and the share of the sweep before the stamp."""
+    """Stamps of the LiDAR, of OXTS by index, or nominal; rate, Hz; share of the sweep before them. is_extract : no sync drive."""
     info, voice = folder.info, folder.voice
     compensated = bool(info.motion_compensated)
     passed = {"timestamps.txt": AHEAD, "timestamps_start.txt": AT_START}
@@ -378,7 +378,7 @@ def _samples(drive: Path) -> tuple[Oxts, Longs]:
 
 
 def _begin(drive: Path, first: int) -> tuple[int, str]:
-    """First scan's time, ns, and its file; times.txt counts from camera 0's first image. InputError if no file tells."""
+    """First scan's time, ns, and its file; times.txt counts from camera 0's first image. InputError without any file."""
     sync = drive.with_name(drive.name.replace("_extract", "_sync"))
     for name in ("image_00", "velodyne_points", "oxts"):
         path = sync / name / "timestamps.txt"

@@ -111,10 +111,7 @@ def of_one_sender(datagrams: Packets, which: Longs, what: str, voice: Voice) -> 
 
 
 def no_slivers(shares: NDArray[np.floating[Any]], voice: Voice) -> Bools:
-    """(N,) whether a revolution is a scan, by its share of the usual number of packets.
-
-    Of an incomplete revolution between missing ones, a few packets may remain: these are no scan. Drops are reported.
-    """
+    """(N,) whether a revolution is a scan, by its share of the usual number of packets; all are if none has enough."""
     keep = shares >= SLIVER
     if keep.all() or not keep.any():
         return np.ones(len(shares), np.bool_)

@@ -193,7 +193,7 @@ def open_clock(
 
 
 def _unwrap(values: NDArray[Any], usable: Bools, width: float) -> tuple[NDArray[Any], int]:
-    """Values with overflows of an integer counter removed (int64), and the number of usable values that changed."""
+    """Values with overflows of a 32-bit or smaller counter removed, int64, if within `width` then; and how many changed."""
     if values.dtype.kind not in "iu":
         return values, 0
     plain = values.astype(np.int64)

@@ -112,7 +112,7 @@ def learn_rule(
 def _agree(
     name: str, readings: list[_TimeReading], points: float, rate_hz: float, unit: str | None, reference: str | None
 ) -> TimeRule:
-    """Rule that fits most of the scans with the usual number of points."""
+    """Rule that fits most of the scans with the usual number of points, in the unit of most of them."""
     usual = Counter(r.unit for r in readings).most_common(1)[0][0]
     readings = [r for r in readings if r.unit == usual]
     # A clock that started with the recording looks like an offset in the first scans.

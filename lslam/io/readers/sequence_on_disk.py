@@ -165,7 +165,7 @@ def _median(values: list[float]) -> float:
 
 
 def _ground(points: Floats) -> float:
-    """Height of the sensor above the most frequent level below it, in the cloud's unit; NaN if few points lie below."""
+    """Height of the sensor above the most frequent level below it, in the unit of points (N, 3); NaN if few lie below."""
     level = np.hypot(points[:, 0], points[:, 1])
     below = -points[points[:, 2] < -0.05 * level, 2]
     if len(below) < _MIN_POINTS:
@@ -176,7 +176,7 @@ def _ground(points: Floats) -> float:
 
 
 def _noise(points: Floats) -> float:
-    """Noise of surfaces: thickness of the flattest patches, as large as a tenth of their range; NaN if there are too few."""
+    """Noise of surfaces in points (N, 3): thickness of the flattest patches, as large as a tenth of their range; or NaN."""
     from scipy.spatial import cKDTree
 
     points = points[:_MOST_POINTS]
@@ -208,7 +208,7 @@ class LabelledSequence(SequenceView):
         self._files = [folder / f"{scan.stem}.label" for scan in scans]
 
     def scan(self, index: int) -> Scan:
-        """Scan `index` with its labels; `fault` tells of missing or mismatched ones. Raises InputError as the sequence."""
+        """Scan `index` with its labels; missing or mismatched ones are in its `fault`. Raises InputError as the sequence."""
         scan = self.whole.scan(index)
         if scan.labels is not None or not len(scan):
             return scan

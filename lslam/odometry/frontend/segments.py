@@ -24,7 +24,7 @@ Begin = Callable[[Floats], Tracker]
 class TrackedScan:
     """A scan with its result; sweep, middle : of the tracker, as of this scan.
 
-    has_both_sides : later scans told the motion within the sweep as well
+    has_both_sides : the motion within the sweep is smoothed with later scans
     """
 
     entry: ScanInput
@@ -145,7 +145,7 @@ class SegmentTracker(Stateful):
 
 
 def _is_less(result: ScanResult, other: ScanResult) -> bool:
-    """Whether so many fewer of a scan's points agree with a map than with the other that it may lie in the wrong place."""
+    """True if much fewer points of a scan agree with a map than with the other: its pose there may be wrong."""
     return _share(result) < UsualAgreement.LESS * _share(other)
 
 

@@ -215,7 +215,7 @@ class WindowTracker(Stateful):
         return replace(initial[0], sweep=_priors(initial)[0]), rest[1]
 
     def _is_away(self, pose: Floats, rest: StartAtRest) -> bool:
-        """Whether a pose (4, 4) is so far from the first spot that a single point would tell, at three sigma."""
+        """Whether a pose (4, 4) is farther from the first position than three sigma of a single point."""
         return apart(rest[1], pose) ** 2 > INLIER_CHI2 * self._noise_m**2
 
     def _elsewhere(self, tracks: list[TrackedScan], rest: StartAtRest) -> list[TrackedScan]:

@@ -57,7 +57,8 @@ def check_agreement(
 
     offset_s : s to add to the IMU's stamps; None estimates it, and returns 0 for an estimate below `least_offset_s`
 
-    Raises ImuRefusedError naming the likely fault: unit, axes, extrinsics, or stamps.
+    There is no verdict on fewer than 5 poses or hardly any rotation. Raises ImuRefusedError naming the likely fault: unit,
+    axes, extrinsics, or stamps.
     """
     if len(stamps_ns) < 5:
         return Agreement(False)
@@ -157,7 +158,7 @@ def _centre(scan_rates: Floats, imu_rates: Floats) -> tuple[Floats, Floats]:
 
 
 def _compare(scan_rates: Floats, imu_rates: Floats) -> tuple[float, float, float]:
-    """Correlation of the rates about their means, how many times larger the felt ones are, and the rms of the seen ones."""
+    """Correlation of rates about their means, ratio of the gyroscope's to the scans' rates, and rms of the scans'."""
     a, b = _centre(scan_rates, imu_rates)
     if not len(a):
         return 0.0, 1.0, 0.0

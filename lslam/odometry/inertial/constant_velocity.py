@@ -125,7 +125,7 @@ class MotionModel(Protocol):
         return None
 
     def imu_state(self) -> ImuState | None:
-        """What is known of the sensor's errors as of the last scan; None without one."""
+        """State and errors of the sensor at the last scan; None without one."""
         return None
 
 

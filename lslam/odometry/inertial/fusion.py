@@ -109,7 +109,7 @@ class InertialMotion(Stateful):
         return prior
 
     def refine(self, prior: MotionPrior, stamp_ns: int, pose: Floats) -> MotionPrior:
-        """The motion within the sweep again, by the state that the registered `pose` (4, 4) at the stamp implies."""
+        """Motion in the sweep again, by the state that `pose` (4, 4) implies, or constant velocity; if integrated, the prior."""
         middle, instant_ns = middle_of(prior, stamp_ns, pose)
         end_ns = stamp_ns + round(1e9 * float(prior.times[-1]))
         is_swept = len(prior.times) > 1
@@ -275,7 +275,7 @@ class InertialMotion(Stateful):
         return self.estimate.propagate(self._since_last(instant_ns), (self._pose @ self.T_lidar_imu)[:3, :3])
 
     def _since_last(self, instant_ns: int) -> Increments:
-        """What the IMU felt since the last scan, integrated once for all who ask before the next `correct`."""
+        """Motion measured by the IMU since the last scan, integrated once until the next `correct`."""
         assert self._instant_ns is not None
         if self._increments is None or self._increments.instants_ns[-1] != instant_ns:
             self._increments = self.estimate.over(self.imu, np.array([self._instant_ns, instant_ns]))

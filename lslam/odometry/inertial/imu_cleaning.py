@@ -28,7 +28,7 @@ MOST_BAD_SHARE = 0.1
 
 
 class ImuFault(StrEnum):
-    """What is wrong with an IMU that is refused, where a program can tell."""
+    """Fault of a refused IMU, as a code for programs."""
 
     UNKNOWN = "unknown"
     GYRO_IN_DEGREES = "gyro-in-degrees"
@@ -92,7 +92,7 @@ def rate_of(imu: ImuStream) -> float:
 
 
 def is_slow(rate_hz: float) -> bool:
-    """Whether a stream of that rate cannot tell how the sensor moves within a sweep; nothing is said of time that stands."""
+    """True if the stream's rate is too low for the motion within a sweep; False for constant stamps."""
     return 0 < rate_hz < (1 - RATE_SLACK_SHARE) * LEAST_RATE_HZ
 
 

@@ -115,7 +115,7 @@ class ImuEstimate:
         return ImuState(values, np.sqrt(np.maximum(variances, 0.0)))
 
     def over(self, imu: ImuStream, instants_ns: Longs) -> Increments:
-        """What the IMU felt between increasing instants, biases taken off."""
+        """Motion measured by the IMU between increasing instants, without biases."""
         return self._integrate(imu, instants_ns, self.gyroscope.bias)
 
     def _integrate(self, imu: ImuStream, instants_ns: Longs, gyro_bias: Floats) -> Increments:

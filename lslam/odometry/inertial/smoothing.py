@@ -160,7 +160,7 @@ class SmootherMotion(InertialMotion):
         return super().rewind(stamp_ns, pose, span)
 
     def _increments_until(self, instant_ns: int) -> Increments | None:
-        """What the IMU felt since the newest state; None where there is no such state, or the IMU was silent since."""
+        """Motion measured by the IMU since the newest state; None without such a state, or in a gap of the IMU."""
         before = self._instant_ns
         has_increments = (
             self._is_begun and before is not None and instant_ns > before and self._covers(before, instant_ns)

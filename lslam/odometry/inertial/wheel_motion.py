@@ -60,9 +60,9 @@ class ReckonedStep:
 
 @dataclass(frozen=True)
 class LearntFromScan:
-    """What a registered step told: the calibration, the accelerations with their counts, and how wrong each predicted, m.
+    """Estimates updated by a registered step: calibration, accelerations with their counts, and prediction errors, m.
 
-    errors : none where surfaces leave the way open
+    errors : none where surfaces do not observe the path length
     """
 
     instant_ns: int

@@ -132,7 +132,7 @@ class IntegrityMonitor(Stateful):
         return 0.0 if self._motion is None else float(np.linalg.norm(self._motion[0][:3, 3])) / self._motion[1]
 
     def _extrapolate(self, seconds: float) -> Floats | None:
-        """The motion (4, 4) over so many seconds if it goes on as before; None where nobody knows."""
+        """The motion (4, 4) over `seconds` at constant velocity; None where that is unknown."""
         if self._motion is None or seconds > MAX_EXTRAPOLATION_S:
             return None
         motion, before = self._motion

@@ -115,7 +115,7 @@ class MotionHypothesis:
         return None if self.result.covariance is None else np.sqrt(np.diag(self.result.covariance))
 
     def own_points(self, other: MotionHypothesis) -> int:
-        """Number of points that this motion explains and the other does not: all that tells them apart."""
+        """Number of points that this motion explains and the other does not."""
         return int(np.count_nonzero(self.on_planes & ~other.on_planes))
 
     def is_same(self, other: MotionHypothesis) -> bool:

@@ -183,7 +183,7 @@ class BagMessages:
         )
 
     def fix(self, stamp_ns: int, lat_lon_alt: Floats, sigma: float, frame: str) -> Any:
-        """NavSatFix message: latitude, longitude (deg) and height (m), with a one-sigma error, m, NaN when it is unknown."""
+        """NavSatFix of latitude, longitude (deg), height (m), (3,), with one sigma, m, NaN when it is unknown."""
         is_known = bool(np.isfinite(sigma))
         latitude, longitude, altitude = (float(v) for v in lat_lon_alt)
         return self._types["sensor_msgs/msg/NavSatFix"](

@@ -66,7 +66,7 @@ class SurveyedPoints:
 
 @dataclass(frozen=True)
 class Survey:
-    """What is delivered of a folder.
+    """Contents of a folder to deliver.
 
     drives : the run by the name of its sequence, or the sessions of a merge, all in one world
     frame : from that world to the delivered coordinates; points : surveyed ones, those that held the run first
@@ -192,7 +192,7 @@ def _control(survey: Survey, projection: Projection) -> SurveyedPoints | None:
 
 
 def _check_points(survey: Survey, projection: Projection, path: Path, control: SurveyedPoints | None) -> SurveyedPoints:
-    """Check points that the run did not use, with their residuals; raises UsageError for one that it did use."""
+    """Points of `path`, with residuals, to check one run; raises UsageError for a merge, or if one is also in `control`."""
     if len(survey.drives) > 1:
         raise UsageError(
             f"--check: {survey.folder} is a merge, whose scans have no numbers of their own: check one of its runs"

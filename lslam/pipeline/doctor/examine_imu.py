@@ -66,7 +66,7 @@ def examine_noise(imu: ImuStream) -> Facts | None:
 
 
 def _longest_still(accel: Floats, gyro: Floats, rate: float) -> slice:
-    """Longest stretch of whole seconds at rest: rates and forces hardly vary within and between them."""
+    """Samples of the longest rest in whole seconds: rates and forces hardly vary; empty without. rate : Hz; others : (M, 3)."""
     width = max(round(rate), 2)
     count = len(gyro) // width
     if not count:
@@ -172,7 +172,7 @@ def examine_imu(sequence: Sequence, findings: Findings) -> Facts | None:
 
 
 def _examine_time(sequence: Sequence, imu: ImuStream, steps: Floats, median: float, findings: Findings) -> int:
-    """Check rate, order, gaps and overlap. Returns the number of gaps."""
+    """Check rate, order, gaps and overlap by `steps` (M-1,), s, and their median. Returns the number of gaps."""
     if median > 0 and is_slow(1 / median):
         what = f"IMU: {1 / median:.1f} Hz, too slow to see shaking within a scan ({LEAST_RATE_HZ:.0f} Hz would do)"
         findings.add("imu-rate", what, "record it faster, of KITTI raw take the `_extract` drive (100 Hz)")
@@ -238,7 +238,7 @@ def _calm_direction(imu: ImuStream) -> Floats:
 
 
 def _tilt(up: Floats, tilt: float) -> Finding:
-    """Finding about a specific force that points `tilt` deg away from up."""
+    """Finding on a specific force that is `tilt` deg away from up; up : (3,) its direction in the LiDAR's frame."""
     axis = int(np.argmax(np.abs(up)))
     name = ("-" if up[axis] < 0 else "+") + "xyz"[axis]
     what = f"IMU: specific force points along {name} of the LiDAR, {tilt:.0f} deg from up (+z)"

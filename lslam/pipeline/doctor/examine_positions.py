@@ -123,7 +123,7 @@ def examine_gnss(sequence: Sequence, findings: Findings) -> Facts | None:
 
 
 def _examine_jumps(fixes: Floats, stamps_ns: Longs, sigma: Floats, findings: Findings) -> int:
-    """Number of fixes farther off the line through their neighbours than acceleration and sigma explain; adds a finding."""
+    """Number of fixes (N, 3) farther off their neighbours' line than acceleration and sigma explain; adds a finding."""
     if len(fixes) < 3:
         return 0
     xy = to_local(fixes, fixes[0])[:, :2]

@@ -118,7 +118,7 @@ def compare(stream: CleanStream, T_lidar_imu: Floats, stamps_ns: Longs, poses: F
 
 
 def _with_axes(stream: CleanStream, R: Floats, stamps_ns: Longs, poses: Floats) -> Agreement:
-    """Agreement after correcting the axes by R, which may be a reflection; before, the clock offset is unobservable."""
+    """Agreement after a correction of axes by R (3, 3), perhaps a reflection; before, the clock offset is unobservable."""
     T = np.eye(4)
     T[:3, :3] = R
     try:
@@ -211,7 +211,7 @@ def _swap(P: Floats, before: float, after: float, axes: int, R_lidar_imu: Floats
 
 
 def _rotation_fit(lidar_rates: Floats, imu_rates: Floats, R_lidar_imu: Floats) -> tuple[Finding, Floats] | None:
-    """Rotation that fits the IMU's rates to the LiDAR's, if it halves the residuals; else None."""
+    """Rotation (3, 3) that fits the IMU's rates (M, 3) to the LiDAR's, if it halves the residuals; else None."""
     spread = np.sqrt(np.maximum(np.linalg.eigvalsh(lidar_rates.T @ lidar_rates / len(lidar_rates)), 0.0))
     if spread[1] < LEAST_TURNING:
         return None  # turns about one axis say nothing of a turn about that axis
@@ -230,7 +230,7 @@ def _rotation_fit(lidar_rates: Floats, imu_rates: Floats, R_lidar_imu: Floats) -
 
 
 def _by_axis(lidar_rates: Floats, imu_rates: Floats) -> list[float | None] | None:
-    """Correlation about x, y, z of the IMU; None about an axis with hardly any rotation."""
+    """Correlation of rates (M, 3) about x, y, z of the IMU; None about an axis with hardly any rotation."""
     if not len(lidar_rates):
         return None
     pairs = zip(lidar_rates.T, imu_rates.T, strict=True)

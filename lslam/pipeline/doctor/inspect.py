@@ -259,7 +259,7 @@ def examine_points(sequence: Sequence, indices: NDArray[Any], findings: Findings
 
 
 def _examine_frame(directions: list[Longs], findings: Findings) -> None:
-    """Check that scans are in their sensor's frame: the ground must be at a constant height below (or above) the origin."""
+    """Finding if many directions with points in the first scan have none later: the clouds seem to be in a world's frame."""
     shares = [empty_share(directions[0], later) for later in directions[1:]]
     if len(shares) > 1 and np.median(shares) > EMPTIED_SHARE:
         findings.add(

@@ -203,6 +203,7 @@ class GraphJob:
     """Child process of `lslam graph`, with the arguments `words` after the run; `out` is its new folder."""
 
     def __init__(self, run: Path, words: list[str]) -> None:
+        """Start the process. Raises OutputError when that fails."""
         self.out = next_folder(run)
         command = [sys.executable, "-m", "lslam", "graph", str(run), *words, "--out", str(self.out)]
         self._is_asked = False
