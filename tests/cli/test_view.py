@@ -27,7 +27,8 @@ from lslam.pipeline.map_files import MapNote, georeference_note, write_map
 from lslam.pipeline.map_tiles import write_tiles
 from lslam.pipeline.plot_run import view_run
 from lslam.pipeline.rebuild import read_run
-from lslam.pipeline.view.sites import MapTiles
+from lslam.pipeline.view.server import RunServer
+from lslam.pipeline.view.sites import MapTiles, ViewedSites
 from lslam.reports.figures import MOST_POINTS, by_height
 
 POINTS = np.random.default_rng(0).uniform(-50, 50, (400, 3))
@@ -102,6 +103,16 @@ def test_tiles_of_a_map_in_utm_lie_in_the_world_of_the_run(
     bare.start()
     bare.stop()
     assert "no map file" in bare.tree()["error"]
+
+
+def test_the_page_of_a_drive_in_an_old_map_gets_no_points_of_the_map_of_the_drive(run: Path) -> None:
+    (run / "config.toml").write_text('[localize]\nmap = "/maps/old.laz"\n')
+    with RunServer() as server:
+        sites = ViewedSites(server)
+        sites.add(run)
+        said = server.sites[0].gets["tiles/tree.json"]({})
+        sites.stop()
+    assert said == {"error": "the page shows the old map, /maps/old.laz, where it differs from the drive"}
 
 
 class Stream:

@@ -139,7 +139,8 @@ def test_more_points_have_the_colours_of_their_sessions(browser: Any, url: str) 
     assert browser.execute_script("return mapView.way_of_colour") == "session"
     # What the page holds by itself is taken away: the tiles alone are seen.
     browser.execute_script(
-        "mapView.names = mapView.names.filter(name => name !== 'map'); mapView.isShaded = false; mapView.draw()"
+        "const map = mapView.drawer.clouds.get('map'); map.cloud = { ...map.cloud, count: 0 };"
+        " mapView.isShaded = false; mapView.draw()"
     )
     shown = picture(browser)
     for colour in (np.array([0, 99, 166]), np.array([209, 72, 10])):  # --c1 and --c2 of a light page

@@ -76,13 +76,15 @@ class ViewedSites:
 
     def add(self, folder: Path) -> int:
         """Serve a run, or a merge of several. Returns its number. Raises InputError for what is none."""
-        number, gets = len(self._server.sites), dict[str, Any]()
+        number, gets, why_not = len(self._server.sites), dict[str, Any](), ""
         posts: dict[str, Any] = dict.fromkeys(("api/edits", "api/graph"), partial(_refuse, folder))
         if (names := sessions_of(folder)) is not None:
             tracks = [read_trajectory(folder / SESSIONS / f"{name}.tum", "tum").positions for name in names]
         else:
             corrections = Corrections(folder)
             tracks = [corrections.run.trajectory.positions]
+            if old := corrections.run.config.localize.map:
+                why_not = f"the page shows the old map, {old}, where it differs from the drive"
             gets = {
                 "api/edits": corrections.edits,
                 "api/pair": corrections.pair,
@@ -93,7 +95,7 @@ class ViewedSites:
                 "api/graph": lambda document: self._begin(corrections, number),
                 "api/stop": lambda document: self._end(number),
             }
-        tiles = MapTiles(folder.resolve(), tracks)
+        tiles = MapTiles(folder.resolve(), tracks, why_not)
         self._tiles.append(tiles)
         gets["tiles/tree.json"] = tiles.tree
         self._server.sites.append(Site(folder, lambda: page_of(folder), gets, posts, tiles.node))
@@ -266,22 +268,23 @@ def next_folder(run: Path) -> Path:
 
 
 class MapTiles:
-    """The octree of a run's map. `start` finds or builds it in a thread, `stop` ends that.
+    """The octree of a run's map. `start` finds or builds it in a thread, `stop` ends that; `why_not` says why there is none.
 
     tracks : (N, 3) m, positions of each trajectory; a point of a tile knows the nearest pose of one, or the nearest of several
     """
 
-    def __init__(self, run: Path, tracks: Sequence[Floats]) -> None:
+    def __init__(self, run: Path, tracks: Sequence[Floats], why_not: str = "") -> None:
         self._run, self._tracks = run, tracks
         self._tree: dict[str, Any] = {}
         self._folder = Path()
-        self._said: dict[str, Any] = {"share": 0.0}
+        self._said: dict[str, Any] = {"error": why_not} if why_not else {"share": 0.0}
         self._is_over = threading.Event()
         self._thread = threading.Thread(target=copy_context().run, args=(self._build,), name="lslam-tiles", daemon=True)
 
     def start(self) -> None:
-        """Begin."""
-        self._thread.start()
+        """Begin, unless there is to be none."""
+        if "error" not in self._said:
+            self._thread.start()
 
     def stop(self) -> None:
         """End the building, and leave nothing of it."""

@@ -53,4 +53,6 @@ test("the bytes of a node are points, columns and nearest poses", () => {
   assert.deepEqual(Array.from(cloud.intensity), [0, 255, 1]);
   assert.deepEqual(Array.from(cloud.kind), [1, 0, 2]);
   assert.deepEqual(Array.from(cloud.nearest), [70_000, 0, 0]);
+  const merged = nodeOf("r4", bytes.buffer, own, { session: new Uint8Array(9), height: [0, 3] });
+  assert.deepEqual([Array.from(merged.session), merged.nearest, merged.height], [[70_000, 0, 0], undefined, [0, 3]]);
 });
