@@ -168,7 +168,7 @@ def _variant(config: Config) -> str:
 
 
 def _check_folder(given: dict[str, Any]) -> None:
-    """Raise UsageError for flags about folders that contradict each other or name a folder that does not exist."""
+    """Raise UsageError for contradicting flags or a missing folder, OutputExistsError for an earlier result."""
     options.check_resume(given, "run")
     if given["profile"] is not None and not given["profile"].absolute().parent.is_dir():
         raise UsageError(f"--profile: {given['profile'].absolute().parent} is not a folder")

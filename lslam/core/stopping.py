@@ -95,7 +95,7 @@ def current() -> Stop:
 
 @contextmanager
 def handle_signals(numbers: Sequence[int] = SIGNALS, may_force: bool = True) -> Iterator[Stop]:
-    """Handle the signals inside the block by a `Stop`; a nested block, or one in another thread, changes nothing."""
+    """Handle signals in the block by a `Stop`, the outer or main thread's if there is one; may_force : as of `Stop`."""
     global _current
     if _current is not None or current_thread() is not main_thread():
         stop = current()

@@ -264,7 +264,7 @@ def _scale(lever: float) -> Floats:
 
 
 def _weak(H: Floats, lever: float, least: float) -> Floats:
-    """(K, 6) directions of the whole sweep about which H (6, 6) has less information than `needed`, rotations scaled by `lever`."""
+    """(K, 6) directions of a sweep about which H (6, 6) has less information than `least`, rotations scaled by `lever`, m."""
     scale = _scale(lever)
     values, vectors = np.linalg.eigh(H * np.outer(scale, scale))
     return np.ascontiguousarray(vectors.T[values <= least])

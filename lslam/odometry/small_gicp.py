@@ -39,6 +39,7 @@ class SmallGicp(Traits):
     """GICP, scan to keyframe map, by the package small_gicp; with several threads its sums may differ in the last digits."""
 
     def __init__(self, preprocess: PreprocessConfig, limits: RegistrationConfig, threads: int = 2) -> None:
+        """Import the package. Raises InputError with the command to install it if it is missing."""
         with importing("small_gicp", install_hint("small-gicp")):
             import small_gicp
         self._package: Any = small_gicp

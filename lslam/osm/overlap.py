@@ -119,7 +119,7 @@ class _Move:
 
 
 def _alignments(one: Solid, ours: Floats, other: Solid, theirs: Floats) -> Iterator[_Move]:
-    """Moves that align a wall with a wall, and corners with corners."""
+    """Moves of `one`, its walls at `ours` (V, 2, 2), m, that align a wall, or corners, with those of `other` at `theirs`."""
     middle = ours[:, 0].mean(axis=0)
     for a, wall in enumerate(ours):
         u, length = _direction(wall)
@@ -141,7 +141,7 @@ def _alignments(one: Solid, ours: Floats, other: Solid, theirs: Floats) -> Itera
 
 
 def _touches(ours: Floats, theirs: Floats) -> Iterator[_Move]:
-    """Moves by translation alone, by which the deepest corner comes to lie on a wall."""
+    """Moves by translation alone that put the deepest corner on a wall; ours, theirs : walls (V, 2, 2), m."""
     for side, corners, walls in ((0, ours[:, 0], theirs), (1, theirs[:, 0], ours)):
         for k, wall in enumerate(walls):
             u, length = _direction(wall)

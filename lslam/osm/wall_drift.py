@@ -237,7 +237,7 @@ def _fit_rates(
     before: WallDrift | None,
     is_varying: bool,
 ) -> WallDrift:
-    """The estimate of `find_wall_drift` under one hypothesis; `sigmas` are `seen_sigma` and `map_sigma`, m."""
+    """`find_wall_drift` beyond the drift `before`, at knots if `is_varying`, else constant; sigmas : seen_sigma, map_sigma, m."""
     assert graph.start_sigma is not None
     length = float(graph.distances[-1])
     apart = min(max(KNOTS_APART_M, length / MOST), MEMORY_M) if is_varying else MEMORY_M

@@ -98,7 +98,7 @@ def write_osm_matches(path: Path, matches: OsmMatches, scans: Sequence[int], pos
 def _match_row(
     match: KeyframeMatch | BuildingMatch, scans: Sequence[int], building: str, pose: Floats
 ) -> tuple[Any, ...]:
-    """Row of osm_matches.csv for a keyframe match or a building match; the pose (3,) is in m and deg."""
+    """Row of osm_matches.csv for a match with its pose (3,), m and rad, written in m and deg; NaN for rank 0."""
     place = (pose[0], pose[1], np.degrees(pose[2])) if match.rank else (np.nan, np.nan, np.nan)
     return (
         match.keyframe,

@@ -193,7 +193,10 @@ def may_go_on(folder: Path, identity: dict[str, str], config: Config) -> bool:
 def _difference(
     inputs: dict[str, Any], version: str, tree: dict[str, Any], identity: dict[str, str], config: Config
 ) -> str:
-    """Differences between the earlier run and this one, in words; empty when there are none."""
+    """First kind of difference from the earlier run, in words: version, configuration, inputs; empty without any.
+
+    inputs, tree : digests and configuration of the earlier run; identity : digests of this one
+    """
     if version != __version__:
         return f"it was begun by lslam {version}, this is {__version__}"
     before, now = map(_flat, (tree, printable_tree(config.model_dump(mode="json"))))

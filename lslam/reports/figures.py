@@ -193,7 +193,7 @@ def _buildings(figure: Any, run: PlottedRun) -> None:
 
 
 def _points(plot: Any, run: PlottedRun, T: Floats | None = None) -> Any:
-    """Draw the map below the other data, coloured by height: dark is low. Raises InputError without a map."""
+    """Draw the map, moved by T (4, 4), below other data, coloured by height, dark is low; InputError without a map."""
     if run.cloud is None or not len(run.cloud):
         raise InputError(f"{run.name} has no map: build one with lslam map")
     points = _some(run.cloud.points)

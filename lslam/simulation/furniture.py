@@ -271,7 +271,7 @@ def _balcony(builder: MeshBuilder, middle: Floats, along: Floats, outward: Float
 
 
 def _gabled_roof(builder: MeshBuilder, width: float, depth: float, eaves: float, pitch: float, along: bool) -> None:
-    """Add two slopes that overhang by 0.4 m and two gables; the ridge runs along the street or across it."""
+    """Add a roof over `width` x `depth` m from `eaves`, m, overhang 0.4 m; along : its ridge runs along the street."""
     w, half = (width / 2, depth / 2) if along else (depth / 2, width / 2)
     # A wide house has a flatter roof.
     rise, over = min(half * pitch, HIGHEST_ROOF), 0.4
@@ -298,7 +298,7 @@ def _gabled_roof(builder: MeshBuilder, width: float, depth: float, eaves: float,
 
 
 def _flat_roof(builder: MeshBuilder, width: float, depth: float, eaves: float) -> None:
-    """Add a roof slab with a parapet, open above it."""
+    """Add a roof slab of `width` x `depth` m at height `eaves`, m, with a parapet, open above it."""
     w, low, high = width / 2, eaves, eaves + 0.5
     builder.add_quads([[[-w, 0, low], [w, 0, low], [w, depth, low], [-w, depth, low]]], Surface.ROOF)
     corners = [(-w, 0.0), (w, 0.0), (w, depth), (-w, depth)]

@@ -79,7 +79,7 @@ def room_line() -> RouteCurve:
 
 
 def build_room(line: RouteCurve, terrain: Terrain, rng: np.random.Generator) -> City:
-    """Build a furnished room with its floor's middle at the origin; the seed places the furniture. `line` is the path in it."""
+    """Build a room with its floor's middle at the origin and furniture at random; `line` is the path in it."""
     builder, half = MeshBuilder(), ROOM_M / 2
     low, high = np.array([-half[0], -half[1], 0.0]), np.array([half[0], half[1], ROOM_M[2]])
     # What is above a start is no roof that one would be caught under.

@@ -258,7 +258,7 @@ def _is_ring(scans: Sequence[Floats], k: int) -> bool:
 
 
 def _is_time(values: Floats) -> bool:
-    """Numbers that run through a sweep, in whatever unit, in the order of the points or of those of each ring."""
+    """True for numbers that run through a sweep, in whatever unit, in the order of the points or of those of each ring."""
     if len(values) < _MIN_POINTS or not np.isfinite(values).all():
         return False
     low, high = float(values.min()), float(values.max())

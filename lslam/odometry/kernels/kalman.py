@@ -172,6 +172,7 @@ def correct_by_displacement(
     """Mean (12,) and covariance (12, 12) of `propagate` after the update by the `displacement` (3,), m, of registration.
 
     noise : (3, 3) covariance of `displacement`, m2; gravity, gravity_sigma : magnitude of gravity and its sigma, m/s2
+    outlier : as in `update`
     """
     H, rest = np.zeros((3, 12)), np.empty(3)
     for i in range(3):
@@ -203,7 +204,10 @@ def turn_bias(rotation: Floats, velocity_arm: Floats, axes: Floats, rest: Floats
 
 @kernel
 def turn_columns(rotation: Floats, velocity_arm: Floats, axes: Floats, seconds: float) -> Floats:
-    """Jacobian (3, 12) of a rotation by the gyroscope's bias and the rows of its axes, for a constant rate."""
+    """Jacobian (3, 12) of `rotation` (3, 3) over `seconds` at constant rate by the gyroscope's bias and the rows of `axes`.
+
+    velocity_arm : (3, 3) s, rotations integrated over the step
+    """
     out, reading, turn = np.zeros((3, 12)), np.empty((3, 1)), np.empty(3)
     logarithm(rotation, turn)
     for i in range(3):

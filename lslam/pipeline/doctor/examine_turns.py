@@ -198,7 +198,7 @@ def _best_axes(correlation: Floats, turns_about: Bools) -> Floats:
 
 
 def _swap(P: Floats, before: float, after: float, axes: int, R_lidar_imu: Floats) -> Finding:
-    """Finding about IMU axes that fit after the signed permutation P (3, 3)."""
+    """Finding: IMU axes fit after the signed permutation P (3, 3). before, after : correlations; axes : number compared."""
     names = ", ".join(("-" if row.sum() < 0 else "") + "xyz"[int(np.argmax(np.abs(row)))] for row in P)
     what = f"IMU: its axes do not fit the scans' turns, ({names}) for (x, y, z) would (correlation {after:.2f}, not {before:.2f})"
     if axes < 2:
