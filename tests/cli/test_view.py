@@ -74,14 +74,14 @@ def test_all_is_shown_in_the_world_of_the_run(run: Path) -> None:
 def test_tiles_of_a_map_in_utm_lie_in_the_world_of_the_run(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_tiled: bool
 ) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     if is_tiled:
         (run / "tiles").mkdir()
         write_tiles(
-            run / "tiles", ArrayCloud.of(POINTS), MapNote("drive", 0.2), 20.0, "laz", read_run(run).georeference
+            run / "tiles", ArrayCloud.of(POINTS), MapNote("drive", 0.2), 100.0, "laz", read_run(run).georeference
         )
         for name in ("map.laz", "map.json"):
             (run / name).unlink()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     for _ in ("built", "from the cache"):
         tiles = MapTiles(run, [np.zeros((1, 3))])
         tiles.start()
