@@ -116,7 +116,8 @@ def write_tiles(
         "tiles": tiles,
         **note.facts(projection, georeference),
     }
-    if items:
+    if items and projection is not None:
+        place_items(items, projection)
         write_text(folder / VPC, json.dumps({"type": "FeatureCollection", "features": items}, indent=1) + "\n")
     write_json(folder / INDEX, index)
     return index
@@ -193,14 +194,21 @@ def check_tiles(folder: Path, size: float, overwrite: bool) -> None:
         folder.mkdir(parents=True, exist_ok=True)
 
 
+def place_items(items: list[dict[str, Any]], projection: Projection) -> None:
+    """Give STAC items their places on the Earth, all at once: PROJ takes longer to begin than for thousands of tiles."""
+    georeference, corners = projection.georeference, []
+    for item in items:
+        x0, y0, z0, x1, y1, z1 = item["properties"]["proj:bbox"]
+        corners += [[x, y, z] for z in (z0, z1) for x, y in ((x0, y0), (x1, y0), (x1, y1), (x0, y1), (x0, y0))]
+    places = to_wgs84(np.array(corners), projection.epsg, georeference.height_epsg, georeference.geoid)
+    for item, own in zip(items, places[:, [1, 0, 2]].reshape(-1, 10, 3), strict=True):
+        item["geometry"] = {"type": "Polygon", "coordinates": [own[:5, :2].tolist()]}
+        item["bbox"] = [*own.min(0).tolist(), *own.max(0).tolist()]
+
+
 def vpc_item(name: str, tile: ArrayCloud, projection: Projection) -> dict[str, Any]:
-    """STAC item of the file `name`, whose points are in the coordinates of the projection, m."""
+    """STAC item of the file `name`, whose points are in the coordinates of the projection, m; `place_items` completes it."""
     low, high = tile.points.min(axis=0), tile.points.max(axis=0)
-    box = [[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]], [low[0], low[1]]]
-    corners = [np.column_stack([box, np.full(5, z)]) for z in (low[2], high[2])]
-    georeference = projection.georeference
-    places = to_wgs84(np.concatenate(corners), projection.epsg, georeference.height_epsg, georeference.geoid)
-    places = places[:, [1, 0, 2]]
     utc = utc_of(tile.columns[TIME_NS]) if TIME_NS in tile.columns else None
     schemas = [_schema(axis, np.dtype(np.float64)) for axis in "XYZ"] + [_schema("Intensity", np.dtype(np.uint16))]
     for column, kind in tile.column_types.items():
@@ -213,8 +221,8 @@ def vpc_item(name: str, tile: ArrayCloud, projection: Projection) -> dict[str, A
         "stac_version": "1.0.0",
         "stac_extensions": [f"https://stac-extensions.github.io/{one}/schema.json" for one in _EXTENSIONS],
         "id": name.split(".")[0],
-        "geometry": {"type": "Polygon", "coordinates": [places[:5, :2].tolist()]},
-        "bbox": [*places.min(0).tolist(), *places.max(0).tolist()],
+        "geometry": None,
+        "bbox": None,
         "properties": {
             "datetime": _UNKNOWN if utc is None else f"{min(utc):%Y-%m-%dT%H:%M:%S}Z",
             "pc:count": len(tile),
