@@ -37,10 +37,7 @@ SIGNIFICANT = 2.0
 
 @dataclass(frozen=True)
 class Level:
-    """The rotation that levels a world, and its source.
-
-    R : (3, 3) from the world before; world : description for files; problem : what was asked for and failed
-    """
+    """Rotation R (3, 3) from a world to a level one; world : description for files; problem : source that failed."""
 
     R: Floats
     world: str

@@ -29,10 +29,7 @@ ROUNDS, SCALE = 30, 1.345
 
 @dataclass
 class CommonFrame:
-    """Both trajectories in one body frame, poses (N, 4, 4), with notes.
-
-    notes : decisions and faults; faults : reasons why the two frames do not agree
-    """
+    """Both trajectories, (N, 4, 4), in one body frame, notes, and faults: reasons why their frames disagree."""
 
     estimate: Floats
     truth: Floats

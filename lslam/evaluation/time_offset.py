@@ -85,7 +85,11 @@ def _linearise(
     turns: bool,
     blocks: NDArray[np.int_],
 ) -> tuple[float, float, float] | None:
-    """Offset's change, ns, sigma, and coherence, by the truth's motion at `stamps`; None with too little motion or overlap."""
+    """Change of the offset, ns, its sigma, and coherence; None with little motion or overlap with the truth.
+
+    own : (N - count, C) motions of the estimate over `count` poses, `is_whole` without gap, by their block
+    reach : ns, over which the truth's motion is differentiated; turns : with rotations
+    """
     inside = _covers(truth.stamps_ns, stamps - reach) & _covers(truth.stamps_ns, stamps + reach)
     use = inside[count:] & inside[:-count] & is_whole
     many = len(np.unique(blocks[use]))

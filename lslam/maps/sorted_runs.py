@@ -24,10 +24,7 @@ _SAMPLE = 4096
 
 
 def rows_folder(beside: Path | None, folder: Path | None) -> tuple[Path, tempfile.TemporaryDirectory[str] | None]:
-    """Folder for rows: `folder`, which stays, or a temporary one in `beside`, with its owner, at whose end it goes.
-
-    Raises OutputError when it cannot be written.
-    """
+    """Folder for rows: `folder`, or a temporary one in `beside` and its owner; OutputError if it cannot be written."""
     try:
         if folder is not None:
             folder.mkdir(parents=True, exist_ok=True)

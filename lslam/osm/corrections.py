@@ -106,10 +106,7 @@ def absent_buildings(
 
 
 def new_walls(buildings: Sequence[Building], sights: Sequence[KeyframeMatch], poses: Mapping[int, Floats]) -> Floats:
-    """Walls (S, 2, 2), m, map frame, seen from `VIEWS` keyframes and part of no building, longest first.
-
-    buildings, poses : as of `absent_buildings`
-    """
+    """Walls (S, 2, 2), m, map frame, of no building, seen from `VIEWS` keyframes, longest first; as `absent_buildings`."""
     from shapely import points, prepare, union_all
 
     known = np.ascontiguousarray(walls_of(buildings)[0].reshape(-1, 4))

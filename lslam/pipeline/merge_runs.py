@@ -97,7 +97,7 @@ def sessions_of(folder: Path) -> dict[str, Path] | None:
 
 
 def read_session(folder: Path, name: str) -> tuple[EarlierRun, Session]:
-    """Session of a run with its keyframes. Raises InputError when there are none."""
+    """Session of a run with its keyframes. Raises InputError for fewer than two, or those of other poses."""
     run = read_run(folder)
     store = KeyframeStore(folder / KEYFRAMES)
     if len(store) < 2:
@@ -136,8 +136,9 @@ def merge_runs(
 ) -> Merge:
     """Connect the sessions, find loops, optimise.
 
+    on_stage : called with the name of each stage; checkpoints : of the loops, to go on from
     The first run defines the world. Raises RunFailedError when no other can be connected to it, InterruptedRunError when
-    `should_stop` says so; InputError and UsageError as `expand_folders` and `read_session`.
+    `should_stop` returns True; InputError and UsageError as `expand_folders` and `read_session`.
     """
     read = [read_session(folder, name) for folder, name in zip(folders, names_of(folders), strict=True)]
     warm_up(config.loops)

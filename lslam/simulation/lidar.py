@@ -241,7 +241,7 @@ def _wrap_angle(angle: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _leave_panes(meeting: Meeting, rays: Rays, hits: Hits, lucky: Bools, returns: Returns | None) -> None:
-    """Reflect some of the rays that hit panes, and let the `lucky` of the others pass.
+    """Reflect some of the rays that hit panes, and let the others among `lucky` (N,) pass; `hits` and `lucky` are updated.
 
     A reflected ray measures a point behind the pane. A passing ray hits the next object; a second pane stops it.
     """

@@ -163,10 +163,7 @@ def _pool(most_at_once: int, count: int, is_persistent: bool = False, tries: int
 
 
 def simulate_scenes(jobs: Sequence[Job], most_at_once: int, progress: StudyProgress) -> None:
-    """Simulate the missing scenes of jobs, each in a process of its own.
-
-    A failed simulation is tried again by its runs, which then report the reason.
-    """
+    """Simulate missing scenes, each in a process; after a failure its runs try again, and report the reason."""
     missing = {job.path: job for job in jobs if job.scene is not None and not job.path.is_dir()}
     if not missing:
         return

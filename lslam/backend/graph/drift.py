@@ -200,10 +200,7 @@ def _length(constraint: Constraint) -> float:
 
 
 def linear_basis(distances: Floats, apart: float = MEMORY_M) -> Floats:
-    """(K-1, n) linear (hat) basis functions of the knots, halfway between keyframes reached after `distances` (K,), m.
-
-    apart : m from knot to knot at the most
-    """
+    """(K-1, n) linear basis of knots at most `apart` m apart, between keyframes reached after `distances` (K,), m."""
     middle, knots = 0.5 * (distances[1:] + distances[:-1]), _knots(distances[-1], apart)
     return np.column_stack([np.interp(middle, knots, unit) for unit in np.eye(len(knots))])
 

@@ -28,10 +28,7 @@ GATE_SIGMAS = 3.0
 
 @dataclass(frozen=True)
 class RelativeUncertainty:
-    """Uncertainty of one keyframe's pose relative to others.
-
-    position : (C, 3, 3) m2, world axes; turn : (C,) rad, standard deviation of the rotation
-    """
+    """Uncertainty relative to others: position (C, 3, 3), m2, world axes; turn (C,), rad, standard deviation."""
 
     position: Floats
     turn: Floats

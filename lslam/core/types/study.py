@@ -179,10 +179,7 @@ class Curve:
 
 @dataclass(frozen=True)
 class Interval:
-    """Mean over seeds with its confidence interval, (V,) each; without one (nan) where fewer than two runs count.
-
-    std : of single runs, likewise nan
-    """
+    """Means over seeds (V,) with confidence interval, and std of single runs; nan where fewer than two runs count."""
 
     mean: Floats
     low: Floats

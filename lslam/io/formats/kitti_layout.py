@@ -316,7 +316,7 @@ def _numbers(words: list[str]) -> list[float] | None:
 
 
 def _transform(values: list[float]) -> Floats:
-    """(4, 4) transform of 12 or 16 numbers, rows of the matrix, or 7, tx ty tz qx qy qz qw; raises ValueError for others."""
+    """Rigid transform (4, 4) of 12 or 16 numbers, rows, or 7, tx ty tz qx qy qz qw; ValueError for other or non-rigid ones."""
     if not np.isfinite(values).all():
         raise ValueError("NaN or infinity")
     if len(values) == 7:

@@ -295,7 +295,7 @@ def is_extra(name: str, kind: np.dtype[Any]) -> bool:
 
 
 def _fields(columns: Columns, is_unix: bool) -> dict[str, NDArray[Any]]:
-    """Values of LAS fields and extra dimensions, by name."""
+    """Values of LAS fields and extra dimensions, by name; is_unix : times are Unix time."""
     fields: dict[str, NDArray[Any]] = {name: v for name, v in columns.items() if is_extra(name, v.dtype)}
     if TIME_NS in columns:
         fields["gps_time"] = gps_time_s(columns[TIME_NS], is_unix)

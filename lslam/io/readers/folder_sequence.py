@@ -137,7 +137,7 @@ class Folder:
         return None if truth is None else replace(truth, frame=self.info.ground_truth_frame or truth.frame)
 
     def sequence(self, **parts: Any) -> FolderSequence:
-        """Sequence made of `parts`, see `FolderSequence`, and the stated facts, with points in m."""
+        """Sequence of `parts`, see `FolderSequence`, and the stated facts, in m; IMU and fixes are read unless in `parts`."""
         info, problems = self.info, self.voice.problems
         if "imu" not in parts:
             parts["imu"], parts["gnss"] = load_streams(self.path, info, self.voice)

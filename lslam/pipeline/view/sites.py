@@ -240,7 +240,7 @@ class GraphJob:
         return {"state": word, "out": self.out.name, "said": list(self._said)}
 
     def stop(self) -> None:
-        """Terminate the child as Ctrl-C does, and kill it where it does not end in time."""
+        """Terminate the child (SIGTERM), and kill it if it does not end in time."""
         if self.is_running:
             self._is_asked = True
             self._child.terminate()
