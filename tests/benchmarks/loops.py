@@ -16,7 +16,6 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.backend.keyframes.select import keyframe_cloud
 from lslam.backend.keyframes.store import KeyframeStore
 from lslam.backend.loops.find_loops import find_loops
 from lslam.backend.loops.scan_context import PlaceIndex
@@ -26,6 +25,7 @@ from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.geometry import se3, so3
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.trajectory import Keyframe
+from lslam.odometry.frontend.keyframing import keyframe_cloud
 from lslam.simulation.scenarios import simulate
 
 Floats = NDArray[np.float64]

@@ -16,7 +16,6 @@ from time import thread_time
 import numpy as np
 from osm import SPACING, true_poses
 
-from lslam.backend.keyframes.select import keyframe_cloud
 from lslam.backend.keyframes.store import KeyframeStore
 from lslam.core.config import Config
 from lslam.core.config.backend import KeyframesConfig, OsmConfig
@@ -27,6 +26,7 @@ from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.trajectory import Keyframe
 from lslam.io.formats.osm_buildings import read_buildings
 from lslam.io.readers import open_sequence
+from lslam.odometry.frontend.keyframing import keyframe_cloud
 from lslam.osm.location import LevelRun
 from lslam.osm.wall_match import match_buildings, match_keyframe, warm_up
 from lslam.osm.walls import OsmMap

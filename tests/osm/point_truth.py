@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.backend.keyframes.select import keyframe_cloud, keyframe_labels
 from lslam.core.config.backend import KeyframesConfig
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.geometry import se2, se3
 from lslam.core.labels import CLASSES
 from lslam.core.types.motion_prior import MotionPrior
+from lslam.odometry.frontend.keyframing import keyframe_cloud, keyframe_labels
 from lslam.osm.walls import classify
 from lslam.simulation.scenarios import simulate
 

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from wall_scenes import misfit, noisy, plain, upright
 
 import lslam
-from lslam.backend.keyframes.select import keyframe_cloud, keyframe_labels
 from lslam.backend.keyframes.store import KeyframeStore, PartOfStore, submap, submap_labels
 from lslam.core.config import Config, load_config
 from lslam.core.config.backend import KeyframesConfig
@@ -20,6 +19,7 @@ from lslam.core.errors import InputError
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
 from lslam.core.types.trajectory import Keyframe
+from lslam.odometry.frontend.keyframing import keyframe_cloud, keyframe_labels
 from lslam.osm.walls import find_walls
 from lslam.pipeline.again import open_again, read_for_graph
 from lslam.pipeline.run import run

@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from lslam.backend.keyframes.select import GRAIN, keyframe_cloud
 from lslam.backend.keyframes.store import KeyframeStore, neighbours, submap
 from lslam.core.config.backend import KeyframesConfig
 from lslam.core.config.input import PreprocessConfig
@@ -14,6 +13,7 @@ from lslam.core.geometry import se3
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
 from lslam.core.types.trajectory import Keyframe
+from lslam.odometry.frontend.keyframing import GRAIN, keyframe_cloud
 
 AT_ONCE = MotionPrior.at_once(np.eye(4))
 CONFIG = KeyframesConfig(voxel=0.3)

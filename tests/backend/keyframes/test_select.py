@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lslam.backend.keyframes.select import KeyframeSelector
 from lslam.core.config.backend import KeyframesConfig
 from lslam.core.geometry import se3
 from lslam.core.types.scan_result import ScanResult, Status
+from lslam.odometry.frontend.keyframing import KeyframeSelector
 
 CONFIG = KeyframesConfig(distance=2.0, angle_deg=15.0)
 

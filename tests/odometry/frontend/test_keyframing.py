@@ -11,7 +11,6 @@ from scipy.spatial import cKDTree
 from stub_sequences import sample
 
 import lslam
-from lslam.backend.keyframes.select import keyframe_cloud
 from lslam.backend.keyframes.store import KeyframeStore
 from lslam.core.config import Config, load_config
 from lslam.core.errors import OutputError
@@ -20,7 +19,7 @@ from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import ScanResult
 from lslam.odometry import create_odometry
-from lslam.odometry.frontend.keyframing import Keyframing
+from lslam.odometry.frontend.keyframing import Keyframing, keyframe_cloud
 from lslam.odometry.frontend.register_scans import estimate
 from lslam.registration.preprocessing.views import with_rings
 from lslam.simulation.scenarios import simulate
