@@ -251,7 +251,7 @@ def _corrections(
 
 
 def _conjugate_gradients(product: Callable[[Floats], Floats], right: Floats, preconditioner: Floats) -> Floats:
-    """x (K, 6) with product(x) = `right` (K, 6); preconditioner : (K, 6, 6) on the diagonal."""
+    """x (K, 6) with product(x) close to `right` (K, 6), in `STEPS` at most; preconditioner : (K, 6, 6) inverse blocks."""
     x, rest = np.zeros_like(right), right.copy()
     z = np.einsum("kij,kj->ki", preconditioner, rest)
     way, size = z.copy(), float(np.sum(rest * z))

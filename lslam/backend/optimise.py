@@ -72,7 +72,8 @@ def run_back_end(
 ) -> BackEnd:
     """Optimise the pose graph with loop closures, fixes and map priors, and correct all scans; odometry's poses on failure.
 
-    hold : solves with a map of buildings instead, None without one; points : control points, which are never rejected
+    turns : rotations by a gyroscope; points : control points, which are never rejected
+    hold : solves with a map of buildings instead, None without one
     """
     keyframes = store.keyframes
     clocks = KeyframeClocks() if clocks is None else clocks

@@ -106,7 +106,10 @@ def absent_buildings(
 
 
 def new_walls(buildings: Sequence[Building], sights: Sequence[KeyframeMatch], poses: Mapping[int, Floats]) -> Floats:
-    """Walls (S, 2, 2), m, map frame, of no building, seen from `VIEWS` keyframes, longest first; as `absent_buildings`."""
+    """Walls (S, 2, 2), m, map frame, seen from `VIEWS` keyframes and part of no building, longest first.
+
+    poses : (3,) x, y (m), yaw (rad) of keyframes by number
+    """
     from shapely import points, prepare, union_all
 
     known = np.ascontiguousarray(walls_of(buildings)[0].reshape(-1, 4))

@@ -285,7 +285,7 @@ def _is_in_use(path: Path) -> bool:
 
 
 def _hold(path: Path) -> IO[str]:
-    """Lock the folder. The previous owner may have removed the lock file between our open and our lock, so check again."""
+    """Lock the folder; raises OutputExistsError if another process holds it. A lock file removed meanwhile is opened again."""
     while True:
         stream = (path / LOCK).open("a")
         if not lock(stream):

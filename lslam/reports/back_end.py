@@ -255,7 +255,7 @@ def state_codes(record: RunRecord) -> NDArray[np.uint8]:
 
 
 def localization_tracks(record: RunRecord) -> tuple[list[Track], list[tuple[str, str]]]:
-    """Parts of the trajectory by state with their legend: held, held in doubt, carried; each reaches to the next scan."""
+    """Parts of the trajectory by state of localisation, with their legend; each reaches to the next scan."""
     xy, codes = record.trajectory.positions[:, :2], state_codes(record)
     styles = np.array([style for _, style in STATES.values()])[codes]
     words = {"s2": "held by the map", "s4": "held, the map has changed there", "carried": "carried by odometry"}

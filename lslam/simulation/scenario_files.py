@@ -67,7 +67,7 @@ def round_corners(corners: Sequence[tuple[float, float]], radius: float, closed:
 
 
 def _arc(corner: Floats, a: Floats, b: Floats, half: float, reach: float) -> Floats:
-    """Arc (N, 2) that touches two lines from `corner` along unit vectors `a` and `b` (2,), `reach` m from it."""
+    """Arc (N, 2) that touches lines from `corner` along units `a`, `b` (2,), `half` their angle, rad, `reach` m from it."""
     radius = reach * portable.tan(half)
     middle = (a + b) / max(float(portable.norm(a + b)), 1e-9)
     centre = corner + middle * radius / portable.sin(half)

@@ -42,7 +42,7 @@ def with_scene_scale(config: Config, sequence: Sequence) -> Config:
 
 
 def in_scale(config: Config, sequence: Sequence) -> Config:
-    """The configuration with the lengths that the user has not set multiplied by the scale of the scene."""
+    """The configuration with the lengths that the user has not set reduced by the scale of a small scene, below 1."""
     free = {
         name: [key for key in keys if key not in getattr(config, name).model_fields_set]
         for name, keys in LENGTHS.items()

@@ -65,8 +65,9 @@ def corners(segments: Floats, reach: float, sharpest: float) -> Floats:
 def votes(
     source: Floats, target: Floats, prior: Floats, window: Floats, cell: Floats, angle_tolerance: float
 ) -> Floats:
-    """Votes (X, Y, A, 4) of pairs of corners for poses: sum of weights, and weighted sums of x, y, m, and yaw, rad.
+    """Votes (X, Y, A, 4) of pairs of corners for poses: sum of weights, weighted sums of x, y, m, and yaw, rad, less `prior`.
 
+    source, target : (N, 5) corners: x, y, m, two angles, rad, weight; prior : (3,) x, y, yaw
     Poses lie within `window` (3,), m, m, rad, of `prior`, in cells of `cell` (3,). The angles of the two corners of a pair
     differ by `angle_tolerance`, rad, at most.
     """

@@ -166,7 +166,7 @@ def _examine_clock(agreement: Agreement, rate_hz: float, findings: Findings) -> 
 
 
 def _examine_axes(lidar_rates: Floats, imu_rates: Floats, R_lidar_imu: Floats) -> tuple[Finding, Floats] | None:
-    """Check for swapped, inverted or rotated axes. Returns the fit and `R_lidar_imu` (3, 3); None with too little rotation.
+    """Finding on swapped, inverted or rotated axes, and the `R_lidar_imu` (3, 3) to use; None if right, or hardly rotating.
 
     lidar_rates, imu_rates : (M, 3) rates of the LiDAR's and the IMU's rotation, in the IMU's axes
     """

@@ -112,7 +112,7 @@ class Corrections:
         return Edits(pairs=pairs, points=points).model_dump()
 
     def save(self, document: Any) -> dict[str, Any]:
-        """Validate and write both files; one without rows is removed. Raises UsageError for invalid entries, OutputError."""
+        """Validate and write both files, none without rows; returns their numbers of rows. UsageError if invalid, OutputError."""
         try:
             edits = Edits.model_validate(document)
             for point in edits.points:
