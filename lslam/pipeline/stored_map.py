@@ -13,8 +13,8 @@ from lslam.core.types.arrays import Floats
 from lslam.core.types.cloud import ArrayCloud
 from lslam.core.types.gnss import Georeference
 from lslam.io.formats.point_files import MAP_SUFFIXES, SUFFIXES, MapCloud, read_cloud
-from lslam.maps.georeference import Projection
-from lslam.pipeline.map_files import Note, georeference_of, note_of, noted_last, read_json
+from lslam.maps.georeference import LocalFrame, Projection
+from lslam.pipeline.map_files import Note, georeference_note, georeference_of, note_of, noted_last, read_json
 from lslam.pipeline.run_folder import require_run
 
 INDEX = "map.json"  # of tiles
@@ -52,9 +52,14 @@ class StoredMap:
         points = np.concatenate([part.points for part in parts])
         return ArrayCloud(self.to_world(points) if in_world else points, intensity)
 
-    def cloud(self, attributes: Collection[str]) -> MapCloud:
-        """The points with their colours and these attributes, block by block, in the world of the run."""
-        return MapCloud(self.files, attributes, self.to_world)
+    def cloud(self, attributes: Collection[str], frame: Projection | LocalFrame | None = None) -> MapCloud:
+        """The points with their colours and these attributes, block by block, in the world of the run or coordinates of it."""
+        if frame is None:
+            return MapCloud(self.files, attributes, self.to_world)
+        own = self.note.get("georeference") if self.note.get("crs") is not None else None
+        if isinstance(frame, Projection) and georeference_note(frame.georeference) == own:
+            return MapCloud(self.files, attributes, lambda points: points)  # PROJ there and back takes as long as LAZ
+        return MapCloud(self.files, attributes, lambda points: frame.apply(self.to_world(points)))
 
 
 def map_of(target: Path) -> StoredMap:

@@ -41,6 +41,7 @@ from pyproj import CRS, Transformer
 from lslam.core.geometry import se3, so3
 from lslam.core.geometry.geodesy import local_crs
 from lslam.io.formats.trajectory_files import read_trajectory
+from lslam.maps.georeference import Projection
 from lslam.reports.plans import nice
 from tests.maps.geoid_grids import write_gtx
 from tests.pages import page
@@ -55,6 +56,21 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> MadeRun:
 @pytest.fixture
 def geoid(tmp_path: Path) -> Path:
     return write_gtx(tmp_path / "geoid.gtx", AT_48, PER_DEGREE)
+
+
+@pytest.mark.parametrize("format_", ["laz", "laz in tiles"])
+def test_a_map_in_the_delivered_coordinates_keeps_each_millimetre(
+    tmp_path: Path, format_: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nor is it carried to the world of the run and back."""
+    run = made(tmp_path / "town", format_)
+    monkeypatch.setattr(Projection, "invert", lambda *_: pytest.fail("carried to the world"))
+    out = delivered(run, tmp_path / "out")
+    before = np.concatenate([laspy.read(path).xyz for path in run.folder.rglob("*.laz")])
+    after = np.asarray(laspy.read(out / "map.laz").xyz)
+    for xyz in (before, after):
+        xyz[:] = xyz[np.lexsort(np.rint(xyz * 1000).T)]
+    np.testing.assert_array_equal(np.rint(after * 1000), np.rint(before * 1000))
 
 
 @pytest.mark.parametrize(

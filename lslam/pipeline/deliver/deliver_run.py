@@ -27,7 +27,7 @@ from lslam.io.formats.point_files import open_map
 from lslam.io.formats.state_files import read_npz
 from lslam.io.formats.text_tables import is_unix_time, utc_of
 from lslam.maps.floor_plan import UNKNOWN, Extent, floor_plan, pixel_size, top_view
-from lslam.maps.georeference import ProjectedCloud, Projection
+from lslam.maps.georeference import Projection
 from lslam.maps.occupancy import OccupancyGrid
 from lslam.pipeline.convert import check_beside, stage
 from lslam.pipeline.convert.to_gpkg import GeoLayer, building_layers, pose_layers, write_gpkg
@@ -125,8 +125,8 @@ def _write_map(folder: Path, survey: Survey) -> tuple[dict[str, str], list[str]]
         way = f"the run was made without one; `lslam map {survey.folder}` builds it"
         return {}, [f"There is no map, and no plan from above: {way}, and then deliver again."]
     attributes = dict(stored.note.get("attributes") or {})
-    cloud = stored.cloud(attributes)
-    write_las(folder / MAP, ProjectedCloud(cloud, survey.frame.apply), survey.frame.wkt)
+    cloud = stored.cloud(attributes, survey.frame)
+    write_las(folder / MAP, cloud, survey.frame.wkt)
     columns = ["intensity", *(name for name in attributes if name != "time")]
     columns += ["colour"] if "red" in cloud.column_types else []
     voxel = f"one in each voxel of {stored.voxel:g} m" if stored.voxel else "every point of every scan"
