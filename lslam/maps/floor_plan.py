@@ -128,13 +128,13 @@ def top_view(cloud: Cloud | NDArray[Any], pixel: float = 0.2, longest: int = 160
     width, height = (int(n) + 1 for n in (high - low) / size)
     counts, sums = np.zeros(width * height, np.int64), np.zeros(width * height)
     for block in cloud.blocks():
-        part = block.points[np.isfinite(block.points).all(1)]
-        cell = np.floor((part[:, :2] - low) / size)
-        inside = (cell[:, 0] >= 0) & (cell[:, 1] >= 0) & (cell[:, 0] < width) & (cell[:, 1] < height)
-        column, row = cell[inside].astype(np.int64).T
-        pixel_of = (height - 1 - row) * width + column
+        x, y, z = block.points.T
+        column, row = np.floor((x - low[0]) / size), np.floor((y - low[1]) / size)
+        # What is not finite is outside.
+        inside = (column >= 0) & (row >= 0) & (column < width) & (row < height) & np.isfinite(z)
+        pixel_of = (height - 1 - row[inside].astype(np.int64)) * width + column[inside].astype(np.int64)
         counts += np.bincount(pixel_of, minlength=width * height)
-        sums += np.bincount(pixel_of, part[inside, 2], minlength=width * height)
+        sums += np.bincount(pixel_of, z[inside], minlength=width * height)
     extent = (float(low[0]), float(low[0] + width * size), float(low[1]), float(low[1] + height * size))
     heights = np.divide(sums, counts, out=np.full(width * height, np.nan), where=counts > 0)
     shape = (height, width)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -86,6 +87,23 @@ class MergedMap:
             yield self._rows.read(start, stop) if isinstance(self._rows, StoredRows) else self._rows[start:stop]
 
 
+@dataclass(frozen=True)
+class ScanSums:
+    """Points of one scan added up where neighbours share a voxel, as `MapMerger` keeps its voxels.
+
+    rows : (R, k), of which the first `count` hold sums, None for a scan that is refused
+    has_intensity : None for a scan without points; scan : its number, where it has observations
+    beyond_gate, outside : points that are left out, `gated` and `outside` of `MapMerger`
+    """
+
+    rows: Longs | None
+    count: int = 0
+    has_intensity: bool | None = None
+    beyond_gate: int = 0
+    outside: int = 0
+    scan: int = 0
+
+
 class MapMerger:
     """Averages scans into voxels, in about 60 bytes per voxel and independent of the order of points and scans.
 
@@ -136,6 +154,7 @@ class MapMerger:
         self._most, self._table = most, KeyedRows(self._base, most, spool, keep)
         self._crop = _EVERYWHERE if crop is None else np.asarray(crop, np.float64).reshape(6)
         self._with_intensity: bool | None = None
+        self._spare: list[Longs] = []
         self.scans = self.gated = self.outside = self.refused = 0
 
     def add(
@@ -150,46 +169,63 @@ class MapMerger:
         The map has intensity only when every scan has; an intensity that is not finite counts as 0. A scan whose pose
         is not finite is refused, counted and logged. Raises InputError when points and intensities differ in number.
         """
-        from lslam.maps.kernels.cells import accumulate
+        self.add_sums(self.sum_up(points, T_world_lidar, intensity, observations))
+
+    def sum_up(
+        self,
+        points: NDArray[Any],
+        T_world_lidar: Floats,
+        intensity: NDArray[Any] | None = None,
+        observations: Observations | None = None,
+    ) -> ScanSums:
+        """First half of `add`, for another thread: scans are summed up in their order, while earlier ones are added."""
+        from lslam.maps.kernels.cells import sum_up
 
         T = np.ascontiguousarray(T_world_lidar, np.float64)
         # Beyond 2**52 voxels the voxel index itself is no longer exact.
         if not np.isfinite(T).all() or np.abs(T[:3, 3]).max() / self._voxel > 2.0**52:
-            self.refused += 1
             log.warning("merged map: a scan is left out because its pose is not finite")
-            return
+            return ScanSums(None)
         cloud = np.ascontiguousarray(points, np.float32).reshape(-1, 3)
         values = _NO_INTENSITY if intensity is None else np.ascontiguousarray(intensity, np.float32).reshape(-1)
         if intensity is not None and len(values) != len(cloud):
             raise InputError(f"merged map: a scan has {len(cloud)} points but {len(values)} intensities; leave one out")
         if self._origin is None:
             self._origin = np.floor(T[:3, 3] / self._voxel).astype(np.int64)
-        if not len(cloud):
-            self.scans += 1
+        tags = tags_of(observations if self._attributes else None)
+        columns = self._base + (intensity is not None)
+        rows = self._spare.pop() if self._spare else np.empty((0, columns), np.int64)
+        if rows.shape[1] != columns or len(rows) < len(cloud):
+            rows = np.empty((len(cloud), columns), np.int64)
+        gates = self._range_min, self._range_max, self._voxel, self._crop
+        count, gated, outside = sum_up(cloud, values, tags, T, *gates, self._origin, rows)
+        has_intensity = None if not len(cloud) else intensity is not None
+        scan = 0 if observations is None else observations.scan
+        return ScanSums(rows, count, has_intensity, gated, outside, scan)
+
+    def add_sums(self, sums: ScanSums) -> None:
+        """Second half of `add`."""
+        from lslam.maps.kernels.cells import add_rows
+
+        if sums.rows is None:
+            self.refused += 1
             return
-        self._settle_intensity(intensity is not None)
-        table = self._table
-        if table.used + len(cloud) > self._most and table.used:
-            table.spill()
-        table.reserve(table.used + len(cloud))
-        table.used, gated, outside = accumulate(
-            cloud,
-            values if self._with_intensity else _NO_INTENSITY,
-            tags_of(observations if self._attributes else None),
-            T,
-            self._range_min,
-            self._range_max,
-            self._voxel,
-            self._crop,
-            self._origin,
-            table.slots,
-            table.rows,
-            table.used,
-        )
         self.scans += 1
-        self._last_scan = max(self._last_scan, 0 if observations is None else observations.scan)
-        self.gated += int(gated)
-        self.outside += int(outside)
+        self.gated += sums.beyond_gate
+        self.outside += sums.outside
+        if sums.has_intensity is None:
+            return
+        self._settle_intensity(sums.has_intensity)
+        self._last_scan = max(self._last_scan, sums.scan)
+        table, more = self._table, sums.rows[: sums.count]
+        if table.used + len(more) > self._most and table.used:
+            table.spill()
+        table.reserve(table.used + len(more))
+        more = np.ascontiguousarray(more[:, : table.rows.shape[1]])
+        table.used = add_rows(more, bool(self._attributes), table.slots, table.rows, table.used)
+        self._spare.append(
+            sums.rows
+        )  # filled again, since the system takes long to provide so much memory for each scan
 
     def result(self) -> MergedMap:
         """The map of all scans, sorted by voxel: the same scans give the same bytes. The merger is empty then."""

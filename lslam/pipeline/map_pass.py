@@ -29,7 +29,7 @@ from lslam.io.formats.text_tables import is_unix_time
 from lslam.maps.clean import Cleaner, PosedScan
 from lslam.maps.every_point import PointCollector
 from lslam.maps.floor_plan import pixel_size, top_view
-from lslam.maps.merge import MapMerger
+from lslam.maps.merge import MapMerger, ScanSums
 from lslam.maps.mesh import denoise
 from lslam.maps.observations import Observations
 from lslam.maps.occupancy import OccupancyMapper
@@ -73,9 +73,15 @@ def build_map(
     maker, count, offer = begin_pass(checkpoints, lambda keep: MapMaker(section, spool, keep, up), poses)
     numbers = range(maker.first_again(count), len(results))
     sequence = with_attributes(sequence, config)
-    for k, scan in posed_scans(sequence, results, config, watch, INTERRUPTED, numbers, count, offer):
-        if scan is not None:
-            maker.add(k, scan)
+    pose_scan = scan_poser(results, config)
+
+    def prepare(scan: Scan) -> tuple[PosedScan, ScanSums | None] | None:
+        posed = pose_scan(scan)
+        return None if posed is None else (posed, maker.sum_up(posed))
+
+    for k, loaded in scans_again(sequence, prepare, numbers, config, watch, INTERRUPTED, count, offer):
+        if loaded.prepared is not None:
+            maker.add(k, *loaded.prepared)
     with asking(watch.should_stop, INTERRUPTED):
         result = replace(maker.finish(), attributes=attribute_notes(section, results[0].stamp_ns))
     labels = ", ".join(config.preprocess.drop_labels)
@@ -131,7 +137,7 @@ def posed_scans(
 def scan_poser(results: list[ScanResult], config: Config) -> Callable[[Scan], PosedScan | None]:
     """Function that deskews a scan by all poses and moves it to its own; it returns None for an unregistered scan.
 
-    For the thread that reads, since merging takes as long as reading and deskewing together.
+    For the thread that reads.
     """
     ego_box, names = config.map.ego_box or config.preprocess.ego_box, config.map.attributes
     results = [result.at_stamp for result in results]
@@ -180,10 +186,16 @@ class MapMaker:
             )
         self._numbers: list[int] = []
 
-    def add(self, number: int, scan: PosedScan) -> None:
-        """Add a registered scan, and its number among all scans."""
+    def sum_up(self, scan: PosedScan) -> ScanSums | None:
+        """Half of the work on a scan, for the thread that reads; None where it cannot be parted."""
+        if self._cleaner is not None or not isinstance(self._merger, MapMerger):
+            return None
+        return self._merger.sum_up(scan.points, scan.T_world_lidar, scan.intensity, scan.observations)
+
+    def add(self, number: int, scan: PosedScan, sums: ScanSums | None = None) -> None:
+        """Add a registered scan, and its number among all scans; sums : of `sum_up`."""
         self._numbers.append(number)
-        self._merge([scan] if self._cleaner is None else self._cleaner.add(scan))
+        self._merge([scan] if self._cleaner is None else self._cleaner.add(scan), sums)
 
     def finish(self) -> BuiltMap:
         """The map of all added scans, with its image from above, a sample, and the processing steps in words."""
@@ -223,9 +235,12 @@ class MapMaker:
             return done
         return self._numbers[-1] + 1 if self._numbers else 0
 
-    def _merge(self, scans: Iterable[PosedScan]) -> None:
+    def _merge(self, scans: Iterable[PosedScan], sums: ScanSums | None = None) -> None:
         for posed in scans:
-            self._merger.add(posed.points, posed.T_world_lidar, posed.intensity, posed.observations)
+            if sums is not None and isinstance(self._merger, MapMerger):
+                self._merger.add_sums(sums)
+            else:
+                self._merger.add(posed.points, posed.T_world_lidar, posed.intensity, posed.observations)
             if self._occupancy is not None:
                 self._occupancy.add(posed.points, posed.T_world_lidar)
 

@@ -16,6 +16,8 @@ OFFSET = 1 << 20
 MASK = (1 << 21) - 1
 # Number of points that are looked up together in a table larger than the processor's caches.
 AHEAD = 64
+# Number of points whose cells are computed together, in arrays that stay in the nearest cache.
+BLOCK = 256
 
 
 @inline
@@ -35,6 +37,17 @@ def hash_key(key: int, mask: int) -> int:
 def index_of(x: float, inverse_size: float) -> int:
     """Voxel index of one coordinate."""
     return int(np.floor(x * inverse_size))
+
+
+@inline
+def fill_keys(coordinates: NDArray[np.float32], inverse_size: float, keys: NDArray[np.int64]) -> None:
+    """Write the keys of points into `keys` (n or more,); coordinates : (3 n,) x, y, z, x, y, ..., m.
+
+    In a row, since of a table (n, 3) LLVM does not know how far one point is from the next: so it takes several at once.
+    """
+    for j in range(len(coordinates) // 3):
+        x, y, z = float(coordinates[3 * j]), float(coordinates[3 * j + 1]), float(coordinates[3 * j + 2])
+        keys[j] = pack(index_of(x, inverse_size), index_of(y, inverse_size), index_of(z, inverse_size))
 
 
 @inline
@@ -103,11 +116,10 @@ def select_in_gate(
 @kernel
 def count_within(points: NDArray[np.float32], limit: float) -> int:
     """Number of points (N, 3) whose three coordinates are finite and smaller than `limit` in magnitude."""
-    count = 0
+    count, coordinates = 0, np.ascontiguousarray(points).reshape(-1)
     for i in range(len(points)):
-        # NaN is not smaller.
-        if abs(points[i, 0]) < limit and abs(points[i, 1]) < limit and abs(points[i, 2]) < limit:
-            count += 1
+        x, y, z = coordinates[3 * i], coordinates[3 * i + 1], coordinates[3 * i + 2]
+        count += (abs(x) < limit) & (abs(y) < limit) & (abs(z) < limit)  # NaN is not smaller
     return count
 
 
@@ -151,10 +163,10 @@ def centroids(
     the first and of the second half of the sweep never share a centroid: they meet where the sweep closes, and the sensor has
     moved in between.
     """
-    n = len(points)
+    n, coordinates = len(points), np.ascontiguousarray(points).reshape(-1)
     table = np.empty(table_size(n), np.int32)
     table[:] = -1
-    keys = np.empty(n, np.int64)
+    keys, ahead = np.empty(n, np.int64), np.empty(BLOCK, np.int64)
     first = np.empty(n, np.int32)
     sums = np.empty((n, 10))
     is_timed = len(times) == n
@@ -168,8 +180,10 @@ def centroids(
     last_key = -1
     slot = 0
     for i in range(n):
+        if i % BLOCK == 0:
+            fill_keys(coordinates[3 * i : 3 * (i + BLOCK)], inverse, ahead)
         x, y, z = float(points[i, 0]), float(points[i, 1]), float(points[i, 2])
-        key = pack(index_of(x, inverse), index_of(y, inverse), index_of(z, inverse))
+        key = ahead[i % BLOCK]
         if is_timed and times[i] > half:
             key = ~key
         # A coordinate beyond all voxels can give any key, the initial one too.
@@ -228,10 +242,10 @@ def means(
     points: NDArray[np.float32], times: NDArray[np.float32], size: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int32]]:
     """Centroids in voxels of `size`, m, like `centroids`: (M, 3) float32, mean time (M,), count (M,), with the same bits."""
-    n = len(points)
+    n, coordinates = len(points), np.ascontiguousarray(points).reshape(-1)
     table = np.empty(table_size(n), np.int32)
     table[:] = -1
-    keys = np.empty(n, np.int64)
+    keys, ahead = np.empty(n, np.int64), np.empty(BLOCK, np.int64)
     # The first point of each voxel; sums relative to it, count, and sum of times.
     first, sums = np.empty((n, 3), np.float32), np.empty((n, 5))
     is_timed = len(times) == n
@@ -247,8 +261,10 @@ def means(
     ax = ay = az = float(np.float32(0.0))
     sx, sy, sz, sn, st = 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(n):
+        if i % BLOCK == 0:
+            fill_keys(coordinates[3 * i : 3 * (i + BLOCK)], inverse, ahead)
         x, y, z = float(points[i, 0]), float(points[i, 1]), float(points[i, 2])
-        key = pack(index_of(x, inverse), index_of(y, inverse), index_of(z, inverse))
+        key = ahead[i % BLOCK]
         if is_timed and times[i] > half:
             key = ~key
         # A coordinate beyond all voxels can give any key, the initial one too.

@@ -14,13 +14,12 @@ order without loss.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lslam.core.kernels.jit import inline, kernel
-from lslam.core.kernels.voxel import AHEAD
+from lslam.core.kernels.voxel import AHEAD, BLOCK
 
 AXIS_BITS = 21
 HALF = 1 << (AXIS_BITS - 1)
@@ -30,6 +29,7 @@ INTENSITY_UNITS = float(2**20)
 _BRIGHTEST = float(2**24)  # of such points a voxel's sum holds 2**19
 SUMS = 5  # columns before the tags
 _NO_TAG = np.iinfo(np.int64).max
+_NO_KEY = -2  # of a point that is refused
 
 
 @inline
@@ -89,7 +89,7 @@ def unpack_cells(keys: NDArray[np.int64], origin: NDArray[np.int64]) -> NDArray[
 
 
 @kernel
-def accumulate(
+def sum_up(
     points: NDArray[np.float32],
     intensity: NDArray[np.float32],
     tags: NDArray[np.int64],
@@ -99,94 +99,132 @@ def accumulate(
     voxel: float,
     crop: NDArray[np.float64],
     origin: NDArray[np.int64],
-    slots: NDArray[np.int32],
     rows: NDArray[np.int64],
-    row_count: int,
 ) -> tuple[int, int, int]:
-    """Add one scan's points to the voxel sums.
+    """Write rows of one scan's points, one for each run of points in one voxel, whose sums are those of the run.
 
     points : (N, 3) sensor frame, m; intensity : (N,) or (0,); tags : (N, 3) or (0, 3); T : (4, 4) world from sensor
     crop : (6,) x_min, x_max, y_min, y_max, z_min, z_max of the world, m: points outside count as gated
     origin : (3,) voxel index in the middle of the key range, which reaches 2**20 voxels to each side
-    slots : (S,) row of each hash slot or -1, S a power of two above used + N
-    rows : (R, 5), three columns more for `tags` and one more for `intensity` when they are given, with R >= used + N
+    rows : (R, 5), three columns more for `tags` and one more for `intensity` when they are given, with R >= N
 
-    Returns the rows used now, the points refused by the range gate (NaN, Inf and zero points included) and the points
+    Returns the number of rows, the points refused by the range gate (NaN, Inf and zero points included) and the points
     outside the key range.
     """
     inverse = 1.0 / voxel
     near, far = range_min * range_min, range_max * range_max
+    n = points.shape[0]
     with_intensity, with_tags = intensity.shape[0] > 0, tags.shape[0] > 0
     brightnesses = rows.shape[1] - 1
-    mask = slots.shape[0] - 1
-    gated = 0
-    outside = 0
-    # Neighbouring points of a ring mostly share a voxel: they are added up as one run, which is looked up once.
-    keys, sums, bright = np.empty(AHEAD, np.int64), np.empty((AHEAD, 4), np.int64), np.empty(AHEAD, np.int64)
-    numbers, likely = np.empty(AHEAD, np.int64), np.empty(AHEAD, np.int64)
-    for begin in range(0, points.shape[0], AHEAD):
-        run, last_key = -1, -1
-        for i in range(begin, min(begin + AHEAD, points.shape[0])):
-            px, py, pz = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
+    # What the loop over a block reads is local, its points are numbered through, and it does not branch: so it works on
+    # several points at once.
+    xx, xy, xz, xt = T[0, 0], T[0, 1], T[0, 2], T[0, 3]
+    yx, yy, yz, yt = T[1, 0], T[1, 1], T[1, 2], T[1, 3]
+    zx, zy, zz, zt = T[2, 0], T[2, 1], T[2, 2], T[2, 3]
+    left, right, front, back, low, high = crop[0], crop[1], crop[2], crop[3], crop[4], crop[5]
+    ox, oy, oz = origin[0], origin[1], origin[2]
+    coordinates = points.reshape(-1)
+    keys, bright = np.empty(BLOCK, np.int64), np.empty(BLOCK, np.int64)
+    xs, ys, zs = np.empty(BLOCK, np.int64), np.empty(BLOCK, np.int64), np.empty(BLOCK, np.int64)
+    gated, outside, run, last_key = 0, 0, -1, -1
+    for begin in range(0, n, BLOCK):
+        count = min(BLOCK, n - begin)
+        part = coordinates[3 * begin : 3 * (begin + count)]
+        for j in range(count):
+            px, py, pz = np.float64(part[3 * j]), np.float64(part[3 * j + 1]), np.float64(part[3 * j + 2])
             r2 = px * px + py * py + pz * pz
-            if not (r2 >= near and r2 <= far and r2 > 0.0):
-                gated += 1
-                continue
-            x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
-            y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
-            z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
-            if x < crop[0] or x > crop[1] or y < crop[2] or y > crop[3] or z < crop[4] or z > crop[5]:
-                gated += 1
-                continue
+            x = xx * px + xy * py + xz * pz + xt
+            y = yx * px + yy * py + yz * pz + yt
+            z = zx * px + zy * py + zz * pz + zt
+            is_in = (r2 >= near) & (r2 <= far) & (r2 > 0.0)
+            is_in = is_in & (x >= left) & (x <= right) & (y >= front) & (y <= back) & (z >= low) & (z <= high)
             x, y, z = x * inverse, y * inverse, z * inverse
             fx, fy, fz = np.floor(x), np.floor(y), np.floor(z)
-            key = pack(np.int64(fx) - origin[0], np.int64(fy) - origin[1], np.int64(fz) - origin[2])
+            key = pack(np.int64(fx) - ox, np.int64(fy) - oy, np.int64(fz) - oz)
+            keys[j] = key if is_in else _NO_KEY
+            xs[j] = np.int64(np.rint((x - fx - 0.5) * UNITS))
+            ys[j] = np.int64(np.rint((y - fy - 0.5) * UNITS))
+            zs[j] = np.int64(np.rint((z - fz - 0.5) * UNITS))
+        if with_intensity:
+            shine = intensity[begin : begin + count]
+            for j in range(count):
+                value = float(shine[j])
+                brightness = min(max(value, -_BRIGHTEST), _BRIGHTEST) if np.isfinite(value) else 0.0
+                bright[j] = np.int64(np.rint(brightness * INTENSITY_UNITS))
+        for j in range(count):
+            key = keys[j]
             if key < 0:
-                outside += 1
+                gated += key == _NO_KEY
+                outside += key != _NO_KEY
                 continue
+            i = begin + j
+            # Neighbouring points of a ring mostly share a voxel.
             if key != last_key:
                 run, last_key = run + 1, key
-                keys[run], numbers[run], bright[run] = key, i, 0
-                sums[run, 0], sums[run, 1], sums[run, 2], sums[run, 3] = 0, 0, 0, 0
-            sums[run, 0] += np.int64(np.rint((x - fx - 0.5) * UNITS))
-            sums[run, 1] += np.int64(np.rint((y - fy - 0.5) * UNITS))
-            sums[run, 2] += np.int64(np.rint((z - fz - 0.5) * UNITS))
-            sums[run, 3] += 1
-            if with_intensity and np.isfinite(intensity[i]):
-                brightness = min(max(np.float64(intensity[i]), -_BRIGHTEST), _BRIGHTEST)
-                bright[run] += np.int64(np.rint(brightness * INTENSITY_UNITS))
-            if with_tags and tags[i, 0] < tags[numbers[run], 0]:
-                numbers[run] = i
+                rows[run, 0] = key
+                rows[run, 1:] = 0
+                if with_tags:
+                    rows[run, SUMS] = _NO_TAG
+            rows[run, 1] += xs[j]
+            rows[run, 2] += ys[j]
+            rows[run, 3] += zs[j]
+            rows[run, 4] += 1
+            if with_intensity:
+                rows[run, brightnesses] += bright[j]
+            if with_tags and tags[i, 0] < rows[run, SUMS]:
+                for k in range(tags.shape[1]):
+                    rows[run, SUMS + k] = tags[i, k]
+    return run + 1, gated, outside
+
+
+@kernel
+def add_rows(
+    more: NDArray[np.int64], has_tags: bool, slots: NDArray[np.int32], rows: NDArray[np.int64], row_count: int
+) -> int:
+    """Add rows (M, k) to those of the same voxels; returns the rows used now.
+
+    slots : (S,) row of each hash slot or -1, S a power of two above used + M; rows : (R, k), R >= used + M
+    has_tags : whether three columns are tags
+    """
+    mask = slots.shape[0] - 1
+    likely = np.empty(AHEAD, np.int64)
+    for begin in range(0, more.shape[0], AHEAD):
+        part = more[begin : begin + AHEAD]
         # Table and rows are far larger than the processor's caches: a batch of rows is fetched before a branch depends on one.
-        for k in range(run + 1):
-            likely[k] = slots[slot_of(keys[k], mask)]
-        for k in range(run + 1):
-            if rows[max(likely[k], 0), 0] != keys[k]:
+        for k in range(part.shape[0]):
+            likely[k] = slots[slot_of(part[k, 0], mask)]
+        for k in range(part.shape[0]):
+            if rows[max(likely[k], 0), 0] != part[k, 0]:
                 likely[k] = -1
-        for k in range(run + 1):
+        for k in range(part.shape[0]):
             row = likely[k]
             if row < 0:
-                row = row_of(keys[k], slots, rows, row_count)
+                row = row_of(part[k, 0], slots, rows, row_count)
                 if row == row_count:
                     row_count += 1
                     rows[row, 1:] = 0
-                    if with_tags:
+                    if has_tags:
                         rows[row, SUMS] = _NO_TAG
-            for n in range(4):
-                rows[row, 1 + n] += sums[k, n]
-            if with_intensity:
-                rows[row, brightnesses] += bright[k]
-            if with_tags and tags[numbers[k], 0] < rows[row, SUMS]:
-                for n in range(tags.shape[1]):
-                    rows[row, SUMS + n] = tags[numbers[k], n]
-    return row_count, gated, outside
+            for n in range(1, SUMS):
+                rows[row, n] += part[k, n]
+            if has_tags and part[k, SUMS] < rows[row, SUMS]:
+                for n in range(SUMS, SUMS + 3):
+                    rows[row, n] = part[k, n]
+            for n in range(SUMS + 3 * has_tags, rows.shape[1]):
+                rows[row, n] += part[k, n]
+    return row_count
 
 
-def unpack(rows: NDArray[np.int64], origin: NDArray[np.int64], voxel: float) -> NDArray[Any]:
+@kernel
+def unpack(rows: NDArray[np.int64], origin: NDArray[np.int64], voxel: float) -> NDArray[np.float64]:
     """(M, 3) float64 mean positions, m, of finished rows (M, 5 or more)."""
-    cells = unpack_cells(rows[:, 0], origin)
-    points = (cells + 0.5 + rows[:, 1:4] / (rows[:, 4:5] * UNITS)) * voxel
-    return np.asarray(points)
+    points = np.empty((len(rows), 3))
+    for i in range(len(rows)):
+        key, count = rows[i, 0], rows[i, 4] * UNITS
+        for axis in range(3):
+            cell = ((key >> (AXIS_BITS * (2 - axis))) & ((1 << AXIS_BITS) - 1)) - HALF + origin[axis]
+            points[i, axis] = (cell + 0.5 + rows[i, 1 + axis] / count) * voxel
+    return points
 
 
 @inline

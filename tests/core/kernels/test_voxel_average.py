@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lslam.maps.kernels.cells import AXIS_BITS, accumulate, enter, unpack
+from lslam.maps.kernels.cells import AXIS_BITS, add_rows, enter, sum_up, unpack
 
 NO_INTENSITY, NO_TAGS = np.zeros(0, np.float32), np.zeros((0, 3), np.int64)
 ORIGIN = np.zeros(3, np.int64)
@@ -24,7 +24,9 @@ def run(
     size = slots or 1 << int(np.ceil(np.log2(2 * len(points) + 2)))
     table = np.full(size, -1, np.int32)
     rows = np.empty((len(points) + 1, 5), np.int64)
-    used, gated, outside = accumulate(points, NO_INTENSITY, NO_TAGS, T, near, far, voxel, ALL, ORIGIN, table, rows, 0)
+    runs = np.empty_like(rows)
+    count, gated, outside = sum_up(points, NO_INTENSITY, NO_TAGS, T, near, far, voxel, ALL, ORIGIN, runs)
+    used = add_rows(runs[:count], False, table, rows, 0)
     return rows[:used], table, gated, outside
 
 
@@ -75,7 +77,9 @@ def test_enter_finds_every_row_again(cloud: NDArray[np.float32]) -> None:
     assert np.array_equal(np.sort(slots[slots >= 0]), np.arange(len(rows)))
     # Adding the same scan to the rebuilt table opens no new row and doubles every sum.
     room = np.concatenate([rows, np.empty((len(cloud), 5), np.int64)])
-    used, *_ = accumulate(cloud, NO_INTENSITY, NO_TAGS, pose(), 0.0, 1e6, 0.5, ALL, ORIGIN, slots, room, len(rows))
+    runs = np.empty((len(cloud), 5), np.int64)
+    count, *_ = sum_up(cloud, NO_INTENSITY, NO_TAGS, pose(), 0.0, 1e6, 0.5, ALL, ORIGIN, runs)
+    used = add_rows(runs[:count], False, slots, room, len(rows))
     assert used == len(rows)
     assert np.array_equal(room[:used, 1:], 2 * rows[:, 1:])
 
