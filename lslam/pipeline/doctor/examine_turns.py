@@ -211,7 +211,7 @@ def _swap(P: Floats, before: float, after: float, axes: int, R_lidar_imu: Floats
 
 
 def _rotation_fit(lidar_rates: Floats, imu_rates: Floats, R_lidar_imu: Floats) -> tuple[Finding, Floats] | None:
-    """Rotation (3, 3) that fits the IMU's rates (M, 3) to the LiDAR's, if it halves the residuals; else None."""
+    """Finding and `R_lidar_imu` (3, 3) that fits the rates (M, 3) best, if it halves the residuals; else None."""
     spread = np.sqrt(np.maximum(np.linalg.eigvalsh(lidar_rates.T @ lidar_rates / len(lidar_rates)), 0.0))
     if spread[1] < LEAST_TURNING:
         return None  # turns about one axis say nothing of a turn about that axis
