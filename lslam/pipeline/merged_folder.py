@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 
 from lslam.backend.graph.factors import regularise
+from lslam.backend.localization.sessions import Session
 from lslam.core import __version__
 from lslam.core.config import Config
 from lslam.core.errors import InputError, InterruptedRunError, LslamError, UsageError
 from lslam.core.geometry import se3
 from lslam.core.types.arrays import Floats
 from lslam.core.types.gnss import Georeference
-from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.sequence import Sequence as Recording
 from lslam.core.types.trajectory import Trajectory
 from lslam.evaluation.evaluate import evaluate
@@ -124,7 +124,7 @@ def _fill(folder: RunFolder, merge: Merge, config: Config, watch: Watch) -> dict
     about: dict[str, Any] = {"refinement": facts} if facts else {}
     built = None
     if config.map.write:
-        built = _map(recordings, merge.results, config, watch, folder.path, merge.sessions[0].up)
+        built = _map(recordings, merge, config, watch, folder.path)
         note = MapNote(
             ", ".join(s.name for s in merge.sessions), config.map.voxel, built.steps, world, built.attributes
         )
@@ -162,6 +162,11 @@ def _recording(run: EarlierRun, config: Config, problems: list[str]) -> Recordin
         return None
 
 
+def _config_of(session: Session, config: Config) -> Config:
+    """The configuration for the raw scans of a session: its run's sensor, mounting and vehicle."""
+    return config.model_copy(update={"preprocess": session.preprocess})
+
+
 def _refine(
     merge: Merge, recordings: Sequence[Recording | None], config: Config, watch: Watch
 ) -> tuple[Merge, dict[str, Any]]:
@@ -169,11 +174,7 @@ def _refine(
     if not config.graph.refine:
         return merge, {}
     drives = [
-        PosedDrive(
-            recording,
-            [result.at_stamp for result in results],
-            config.model_copy(update={"preprocess": session.preprocess}),
-        )
+        PosedDrive(recording, [result.at_stamp for result in results], _config_of(session, config))
         for recording, results, session in zip(recordings, merge.results, merge.sessions, strict=True)
         if recording is not None
     ]
@@ -249,23 +250,17 @@ def _georeference(merge: Merge) -> Georeference | None:
     return None
 
 
-def _map(
-    recordings: Sequence[Recording | None],
-    results: Sequence[list[ScanResult]],
-    config: Config,
-    watch: Watch,
-    spool: Path,
-    up: Floats,
-) -> BuiltMap:
-    """Map of the scans of all sessions; up : (3,) unit vector in their common world."""
+def _map(recordings: Sequence[Recording | None], merge: Merge, config: Config, watch: Watch, spool: Path) -> BuiltMap:
+    """Map of the scans of all sessions."""
+    results = merge.results
     watch.on_start(
         "map", sum(len(r) for r, recording in zip(results, recordings, strict=True) if recording is not None)
     )
-    maker, number = MapMaker(config.map, spool, up=up), 0
-    for recording, poses in zip(recordings, results, strict=True):
+    maker, number = MapMaker(config.map, spool, up=merge.sessions[0].up), 0
+    for session, recording, poses in zip(merge.sessions, recordings, results, strict=True):
         if recording is None:
             continue
-        for k, scan in posed_scans(recording, poses, config, watch, INTERRUPTED):
+        for k, scan in posed_scans(recording, poses, _config_of(session, config), watch, INTERRUPTED):
             if scan is not None:
                 maker.add(number + k, scan)
         number += len(poses)

@@ -76,6 +76,19 @@ def test_the_map_is_of_both(runs: Path, town: Path) -> None:
     assert strict_json((town / "map.json").read_text())["sequence"] == "monday-run, tuesday-run"
 
 
+def test_the_map_has_no_points_of_the_vehicles_of_its_runs(runs: Path, town: Path, tmp_path: Path) -> None:
+    """The box of tuesday's vehicle holds all that is seen ahead: the merge's own configuration knows nothing of it."""
+    shutil.copytree(runs / "tuesday-run", tmp_path / "tuesday-run")
+    text = (tmp_path / "tuesday-run" / "config.toml").read_text()
+    assert "\n[preprocess]\n" in text
+    box = "\n[preprocess]\nego_box = [0.0, 500.0, -500.0, 500.0, -500.0, 500.0]\n"
+    (tmp_path / "tuesday-run" / "config.toml").write_text(text.replace("\n[preprocess]\n", box))
+    folders = [runs / "monday-run", tmp_path / "tuesday-run"]
+    merge_into(folders, tmp_path / "town", load_config(None, []), Watch())
+    both, fewer = (len(read_cloud(folder / "map.ply").points) for folder in (town, tmp_path / "town"))
+    assert fewer < 0.98 * both
+
+
 def test_sessions_on_the_earth_are_sought_where_they_lie(runs: Path, tmp_path: Path) -> None:
     on_earth = Projection(Georeference(np.array([49.0112, 8.4229, 115.0]), np.eye(4), 25832))
     truths = {name: town_poses(runs, name)[:20, :3, 3] for name in ("monday", "tuesday")}
