@@ -90,7 +90,7 @@ class Attempt:
 
     @property
     def annealing(self) -> Annealing:
-        """The kernel's schedule: from the recent error of the motion prior, or narrow about one that is nearly right."""
+        """The kernel's schedule: it begins at the recent error of the motion prior, or near `KERNEL_MIN_M` with `is_near`."""
         c, h = self.config, self.history
         width = NEAR_KERNEL_FACTOR * KERNEL_MIN_M if self.is_near else h.threshold.width
         steps = c.max_iterations * self.target.times_steps

@@ -32,9 +32,11 @@ class GaussianMap(Stateful):
     Parameters
     ----------
     size : m, edge of a voxel
-    min_points, planarity, count_cap : when a voxel is matched, when it is a plane, how much it remembers
-    reach : m, voxels farther than this from the sensor are given back
-    breadth : how broad points must lie across the beams that saw them, see `kernels.gaussians`; 0: not asked
+    min_points : points that a voxel needs before it is matched; planarity : as `PLANARITY`, above which it is a plane
+    count_cap : effective number of points of a voxel at most: older ones fade
+    reach : m, voxels farther than this from the sensor are removed
+    capacity : voxels that fit before the arrays are enlarged
+    breadth : least spread of a plane's points across the beams that saw them, see `kernels.gaussians`; 0: any
     scan_variance : m2, variance that the points of one scan share, along the normal: of their pose, in a map of several scans
     """
 

@@ -31,8 +31,9 @@ from lslam.registration.voxel_target import VoxelTarget
 class Registration(Stateful):
     """Registers scans one after the other against a local map that it keeps, and recovers lost ones.
 
-    recovery : the policies to try; None: all
+    recovery : which of the standard recovery policies are tried; None: all
     target : the maps and residuals; None: Gaussian voxels of all points
+    policies : recovery policies in place of those of `recovery`, in the order in which they are tried
 
     >>> import numpy as np
     >>> from lslam import Registration
@@ -71,11 +72,14 @@ class Registration(Stateful):
         return local_map
 
     def register(self, points: NDArray[Any], prior: Floats | None = None) -> RegistrationResult:
-        """Pose of points (N, 3), m, LiDAR frame; without `prior` (4, 4) the last motion goes on."""
+        """Register points (N, 3), m, LiDAR frame, and enter them into the map; without `prior` (4, 4) by constant velocity."""
         return self.align(prepare_points(points, self.preprocess, self._index), prior)
 
     def align(self, points: Any, prior: Floats | None = None) -> RegistrationResult:
-        """As `register`, for points that are prepared already. Raises InputError for a prior that is no finite (4, 4)."""
+        """Pose of prepared points, as of `register`: without `prior` (4, 4) the sensor is taken to move on at constant velocity.
+
+        Raises InputError for a prior that is no finite (4, 4).
+        """
         before, last = self._last
         T_prior = se3.normalise(last @ se3.relative(before, last)) if prior is None else np.asarray(prior, np.float64)
         if T_prior.shape != (4, 4) or not np.isfinite(T_prior).all():

@@ -46,7 +46,7 @@ class RestDetector(Stateful):
         self._stayed = self._last_stay = 0
 
     def judge(self, result: RegistrationResult) -> RegistrationResult:
-        """The result, which says whether the sensor is at rest; a failed one says nothing."""
+        """The result, whose `is_stationary` says whether the sensor is at rest; a failed one is returned unchanged."""
         if not result.ok:
             return result
         if self._is_near(result):
@@ -199,7 +199,7 @@ class Rest(Stateful):
         return float(np.linalg.norm(level[:3]) + np.linalg.norm(level[3:]) * lever_arm)
 
     def enter(self, cloud: NDArray[np.float32], T_world_lidar: Floats, lever_arm: float) -> None:
-        """One more scan: points (N, 3), m, LiDAR frame, at its pose (4, 4), which may have left the spot."""
+        """Count one more scan at the spot, or begin a new spot with it: points (N, 3), m, LiDAR frame, and pose (4, 4)."""
         away = self._away(T_world_lidar, lever_arm)
         if self._cloud is not None and away < self._reach:
             self.scans, self._squares = self.scans + 1, self._squares + away**2

@@ -31,11 +31,11 @@ class RegistrationResult:
     matched : points that found a voxel; overlap : matched / source
     rmse : weighted distance to the planes, m; degenerate : (K, 6) unobserved unit directions (rotation scaled by lever arm)
     prior_error : correction of the motion prior, (m, rad)
-    feature_result : the result of the method's features, in whose place this one stands
+    feature_result : the result of the method's features, if this one, of all points, replaces it
     points : what was registered, deskewed; detail : whatever else the method's own `update` needs
     sweep : the motion within the sweep, of a method that estimates it itself; None: the prior's, which the pose refines
     map_age : as `ScanResult.map_age`
-    inertial : the state of the IMU that a smoother of its own found, for the motion model
+    inertial : the state of the IMU by a tightly coupled method's own estimator, for the motion model
     stages : seconds per stage
     """
 

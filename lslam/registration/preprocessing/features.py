@@ -240,6 +240,7 @@ def _thin(
     times: NDArray[np.float32] | None,
     grid_step: float,
 ) -> FeaturePoints:
+    """The points of the `mask` (N,) of a ring walk, or their centroids in cells of `grid_step`, m, ring by ring; 0: points."""
     at = np.flatnonzero(mask)
     if grid_step == 0:
         return FeaturePoints(walk.points[at], rings[at], None if times is None else times[at])
