@@ -235,6 +235,7 @@ class MapMerger:
                 self.outside,
                 self._voxel * 2**20 / 1000,
             )
+        self._spare.clear()
         origin = np.zeros(3, np.int64) if self._origin is None else self._origin
         rows = self._table.result(partial(_add_up, has_tags=bool(self._attributes)))
         types = column_types(self._attributes, self._last_scan)
