@@ -176,7 +176,7 @@ def test_coordinates_of_a_run_with_no_place_on_the_earth_are_refused() -> None:
         check_config(load_config(settings=["gnss.crs=25832", place], environ={}))
 
 
-@pytest.mark.parametrize("setting", ['loops.file="edits.csv"', 'graph.control="points.csv"', "graph.refine=true"])
+@pytest.mark.parametrize("setting", ['loops.file="edits.csv"', 'graph.control="points.csv"'])
 def test_what_works_on_a_graph_is_refused_where_a_map_holds_the_poses(setting: str) -> None:
     check_config(load_config(settings=[setting], environ={}))
     with pytest.raises(UsageError, match="--control do nothing there, drop them"):
