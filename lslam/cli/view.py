@@ -20,7 +20,7 @@ HELP = f"""Show a run in the browser: its report with all points of the map, and
 
 The page is served to this machine alone, at an address that nobody else knows, until Ctrl-C. What is corrected there goes into
 edits.csv and points.csv of the run folder, and the graph that is made with them into a new folder beside it.
-RUN may be the folder of a merge, whose map is shown and whose loops are corrected in its runs.
+RUN may be the folder of a merge: its map is shown, and its loops are corrected in the single runs, which are merged again.
 
 \b
 --rerun writes a recording for the rerun viewer instead, which it needs: {install_command("view")}

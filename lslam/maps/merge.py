@@ -178,7 +178,7 @@ class MapMerger:
         intensity: NDArray[Any] | None = None,
         observations: Observations | None = None,
     ) -> ScanSums:
-        """First half of `add`, for another thread: scans are summed up in their order, while earlier ones are added."""
+        """First half of `add`, for one other thread, which sums up scan after scan while earlier ones are added."""
         from lslam.maps.kernels.cells import sum_up
 
         T = np.ascontiguousarray(T_world_lidar, np.float64)
@@ -223,9 +223,8 @@ class MapMerger:
         table.reserve(table.used + len(more))
         more = np.ascontiguousarray(more[:, : table.rows.shape[1]])
         table.used = add_rows(more, bool(self._attributes), table.slots, table.rows, table.used)
-        self._spare.append(
-            sums.rows
-        )  # filled again, since the system takes long to provide so much memory for each scan
+        # Filled again: the system takes long to provide so much memory for each scan.
+        self._spare.append(sums.rows)
 
     def result(self) -> MergedMap:
         """The map of all scans, sorted by voxel: the same scans give the same bytes. The merger is empty then."""

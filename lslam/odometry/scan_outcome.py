@@ -82,7 +82,7 @@ def fault(pose: Floats, stamp_ns: int, last: ScanResult | None) -> str:
     """The reason why a pose (4, 4) at `stamp_ns` is invalid or unreachable for a vehicle; empty where it is plausible.
 
     last : the newest accepted result; reachability counts the time since then, so that a method which jumped once is
-     accepted again as soon as it may have got there
+        accepted again as soon as it may have got there
     """
     pose = np.asarray(pose)
     if pose.shape != (4, 4) or not np.isfinite(pose).all():

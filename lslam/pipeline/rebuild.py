@@ -347,8 +347,8 @@ def _statuses(path: Path, count: int) -> tuple[Status, ...]:
 def renew_files(target: Path, folder: Path, record: RunRecord) -> None:
     """Write into `target` the files of the run folder `folder`, with the parts about its map updated.
 
-    record : of the new map, for the drawings, and the new manifest. A report that the run did not write is
-     not made; unreadable files are left unchanged, with a warning. Raises OutputError.
+    record : of the new map, for the drawings, and the new manifest
+    A report that the run did not write is not made; unreadable files are left unchanged, with a warning. Raises OutputError.
     """
     before, new = read_json(folder / EVALUATION), run_document(record, None) or {}
     if before or not (folder / EVALUATION).exists():

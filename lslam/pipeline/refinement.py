@@ -209,7 +209,7 @@ def thinner_windows(gain: Floats, scans: Longs, cells: Longs, count: int) -> Boo
     """(K,) whether each of `count` scans lies in a window whose planes became significantly thinner.
 
     gain : (N,) change of the logarithm of the thickness about points of `scans` (N,); points in one of the `cells` (N, 3) count
-     as one measurement
+        as one measurement
     """
     windows = np.minimum(np.arange(count) // WINDOW, max(count // WINDOW - 1, 0))
     is_thinner = np.zeros(int(windows[-1]) + 1, bool)

@@ -58,8 +58,8 @@ def run(
     Raises
     ------
     RunFinishedError : `resume`, and the run is complete. RunFailedError : diverged. InterruptedRunError :
-     `watch.should_stop` returned True. GateError : `input.strict` and the run is degraded. In these three, everything up to
-     there is written. InputError, OutputError, UsageError : as named.
+        `watch.should_stop` returned True. GateError : `input.strict` and the run is degraded. In these three, everything up to
+        there is written. InputError, OutputError, UsageError : as named.
     """
     watch = watch or Watch()
     config = config or Config()

@@ -84,7 +84,7 @@ def trace(
     """Simulate one scan of `model`.
 
     T_city_lidar : (4, 4) one pose for all rays (a motion-compensated scan, without times), or (columns, 4, 4) the pose at
-     each firing (a distorted scan: points in the LiDAR frame of their own instant, times from 0 to `period` s)
+        each firing (a distorted scan: points in the LiDAR frame of their own instant, times from 0 to `period` s)
     rng : source of noise and losses
     bodies : moving objects; a ray hits them at their poses when it is fired (at `stamp_ns` in a compensated scan)
     glass : share of the rays on a pane that pass it and hit objects behind

@@ -207,15 +207,15 @@ def simulate(
     ----------
     scenario : a name of `scenario_names()` or a `Scenario`; seed : of the city, the path and the noise, >= 0
     lidar : a name of `LIDARS` or a model; count : scans (default: one lap, or to the end of the street; on a closed line
-     more scans mean more laps)
+        more scans mean more laps)
     speed, start_speed : m/s, cruising and at the first scan (0: from rest); lower in tight bends
     motion_compensated : False fires every column from its own pose and gives times per point; None: as the scenario says
     settings : overrides of a scenario given by name, "world.relief=1"
     way_points : a line, or a file of one, instead of the scenario's; the city is built round it
     osm : an OpenStreetMap extract (XML or Overpass JSON) whose buildings are the city, x east and y north of the origin;
-     without `way_points` the drive goes along its streets
+        without `way_points` the drive goes along its streets
     origin : lat, lon (deg) and perhaps height (m) of the city's x = y = 0 (default: the middle of the extract's buildings,
-     else the first point of GeoJSON way-points, else an arbitrary position)
+        else the first point of GeoJSON way-points, else an arbitrary position)
     imu, gnss : an IMU (a name of `IMUS` or a model) and a receiver on the carrier; wheels : of a car
     static_start : s of standstill before the drive begins, 0: as in the scenario; its scans add to a default `count`
     visit : another drive through the same town: other traffic and noise, another start, the opposite direction
@@ -223,7 +223,7 @@ def simulate(
     Raises
     ------
     UsageError : unknown names and keys, numbers out of range, more scans than the street is long, an impossible path:
-     through a building or the ground, or too sharp a bend
+        through a building or the ground, or too sharp a bend
     InputError : a file that is missing or damaged, an extract without buildings or far from the path
     """
     chosen = find_scenario(scenario, settings) if isinstance(scenario, str) else scenario

@@ -46,7 +46,7 @@ def find_loops(
     clocks : measure the time of each keyframe, stage `loops`
     threads : number of keyframes verified at once; the candidates do not depend on it
     keyframes : those of the store at other poses than odometry's; forbidden : pairs excluded as candidates, with those around
-     them
+        them
     up : (3,) unit vector, up in their world by the mounting of the sensor
 
     An accepted candidate carries its constraint, T_a_b between LiDAR frames. Raises InterruptedRunError when `should_stop`

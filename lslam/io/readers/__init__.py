@@ -60,6 +60,8 @@ def open_sequence(
 ) -> Sequence:
     """Open a recorded sequence without reading its scans.
 
+    Arguments override `sequence.toml`, which overrides the defaults of the layout.
+
     Parameters
     ----------
     name_or_path : a folder, a bag, or a name looked up under `data_root` (or LSLAM_DATA): `seq07`, `07`, a raw drive
@@ -71,7 +73,6 @@ def open_sequence(
     lidar_frame : which of the LiDARs that share a topic, by the frame of their messages, or `all`
     point_times : source of the times of points: field, columns, order, azimuth or none; None and auto find out
     extrinsics : T_lidar_imu, as numbers or a file (see `read_transform`)
-     Arguments override `sequence.toml`, which overrides the defaults of the layout.
     imu, gnss : whether the stream is needed: if the recording has none, it is searched elsewhere, as in KITTI's raw drive
 
     Raises

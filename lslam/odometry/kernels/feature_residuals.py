@@ -160,9 +160,9 @@ def linearise_planes(
     """Add all planar points (S, 3) to H, S, g and facts, like `linearise_edges`. S takes only planes of well-known normal.
 
     normals : (N, 3) of the surface around each point of the grid, zero where unknown. The normal of three points
-     a few decimetres apart has an error of ten degrees and more, and a sum of such normals seems to observe every
-     direction, the one along a corridor included. So the residual is the distance to the plane through the three
-     points, but its Jacobian uses the surface's normal: an instrumental variable, whose error is independent of theirs.
+        a few decimetres apart has an error of ten degrees and more, and a sum of such normals seems to observe every
+        direction, the one along a corridor included. So the residual is the distance to the plane through the three
+        points, but its Jacobian uses the surface's normal: an instrumental variable, whose error is independent of theirs.
     """
     (source,) = points
     surface, rings, starts, keys, table, normals = grid

@@ -43,7 +43,7 @@ def convert_trajectory(
     """Write `trajectory` to `out` as `kind`, as poses of `frame`, by default the format's own body. Returns the written one.
 
     place : where on the Earth the world of the poses lies. `kml` and `gpx` need a georeference; with a projection, `csv` is a
-     table in its coordinate reference system. Poses that are not finite are left out then.
+        table in its coordinate reference system. Poses that are not finite are left out then.
     Raises InputError: the change of body needs an extrinsic that `calibration` does not have, or no pose is finite. UsageError:
     unknown `kind` or `frame`, or a coordinate reference system that is not in metres. OutputExistsError: `out` exists and
     `overwrite` is not set.
