@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path, PurePath
 from typing import Any
 
 import click
 
 from lslam.cli import options
-from lslam.cli.console import show, show_json, show_rows
+from lslam.cli.console import Stages, setup_logging, show, show_json, show_rows
 
 _MOST_FILES = 8  # named
 
@@ -81,12 +82,14 @@ def _size(count: int) -> str:
 )
 @options.reading
 @options.as_json
+@options.verbosity
 def command(sequence: str | None, as_json: bool, imu_toml: Path | None, **given: Any) -> None:
     """Show the contents and the faults of SEQUENCE: a folder, a bag, or a name under the data root.
 
     Of a bag all topics are listed, also where none has clouds. Each finding comes with advice.
     The first scans are registered, to compare their rotations with the IMU's.
     """
+    setup_logging(given["verbose"], given["quiet"])
     if given["machine"] or sequence is None:
         _show_machine(sequence, given["machine"], as_json)
         return
@@ -104,7 +107,10 @@ def command(sequence: str | None, as_json: bool, imu_toml: Path | None, **given:
         raise
     from lslam.pipeline.doctor.inspect import inspect
 
-    facts = inspect(recording, None if given["all_scans"] else given["scans"], given["quick"], given["with_cameras"])
+    with ExitStack() as stack:
+        stages = Stages(stack)
+        count = None if given["all_scans"] else given["scans"]
+        facts = inspect(recording, count, given["quick"], given["with_cameras"], stages.begin, stages.step)
     if imu_toml is not None:
         _write_noise(imu_toml, facts)
     if as_json:

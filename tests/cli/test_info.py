@@ -24,7 +24,7 @@ def test_page_and_json(tmp_path: Path) -> None:
     folder = kitti_root(tmp_path)
     (folder / "velodyne" / "000002.bin").write_bytes(bytes(1001))
     (folder / "velodyne" / "000003.bin").write_bytes(b"")
-    page = lslam("info", "seq07", "--data-root", tmp_path)
+    page = lslam("info", "seq07", "--data-root", tmp_path, "-q")
     assert (page.returncode, page.stderr) == (0, "")
     for line in ("kitti-odometry", "6 in 0.50 s, 10 Hz", "6 (1 unreadable, 1 empty)", "path 5.00 m", "000002.bin"):
         assert line in page.stdout

@@ -34,6 +34,10 @@ LONG = [
     "simulate",
     "convert",
     "map",
+    "info",
+    "eval",
+    "plot",
+    "view",
 ]
 
 
@@ -128,6 +132,7 @@ def test_other_commands_tell_of_their_stages(told: tuple[Path, list[Event]], tmp
         (("map", folder, "--voxel", "0.5", "--out", tmp_path / "map.ply"), {"map"}),
         (("convert", SAMPLE, "--count", "3", "--to", "kitti", "--out", tmp_path / "kitti"), {"convert"}),
         (("graph", folder, "--no-map", "--out", tmp_path / "graph"), {"odometry", "loops", "pose graph"}),
+        (("info", SAMPLE, "--quick", "--all"), {"point times", "points", "sensors"}),
     ):
         done = lslam(*words, "--progress", "json")
         assert done.returncode == 0, done.stderr

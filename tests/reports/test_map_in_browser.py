@@ -77,12 +77,28 @@ def test_every_control_of_the_map_does_something(browser: Any, page: Path, width
     before = picture(browser)
     for name, value, back in (
         ("from", 60, 2), ("to", 40, 98), ("size", 4, 1), ("shade", False, True), ("colour", "camera colours", "height"),
-        ("colour", "class", "height"), ("colour", "intensity", "height"), ("section", "way", ""),
+        ("colour", "class", "height"), ("colour", "intensity", "height"), ("colour", "time", "height"),
+        ("section", "way", ""),
     ):  # fmt: skip
         choose(browser, name, value)
         assert (before != picture(browser)).any(axis=2).mean() > MOVED / 4, name
         choose(browser, name, back)
     assert (before != picture(browser)).any(axis=2).mean() < MOVED / 4
+    for there, back in (("in", "out"), ("in", "reset")):
+        click(browser, f"[data-do={there}]")
+        assert (before != picture(browser)).any(axis=2).mean() > MOVED / 4, there
+        click(browser, f"[data-do={back}]")
+        assert (before != picture(browser)).any(axis=2).mean() < MOVED / 4, back
+    size = find(browser, ".stage").size
+    find(browser, "[data-do=fill]").click()  # by the mouse: a script alone may not
+    settle(browser)
+    filled = find(browser, ".stage").size
+    assert browser.execute_script("return document.fullscreenElement === mapView.figure")
+    assert filled["width"] >= size["width"]
+    assert filled["height"] > size["height"]
+    find(browser, "[data-do=fill]").click()
+    settle(browser)
+    assert find(browser, ".stage").size == size
     assert find(browser, ".tools details").get_attribute("open") == (None if width == 400 else "true")
     assert browser.execute_script("return document.documentElement.scrollWidth") <= width
     assert browser.get_log("browser") == []

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -101,22 +101,33 @@ _FOLLOWS = {
 }
 
 
-def inspect(sequence: Sequence, samples: int | None = 50, is_quick: bool = False, with_cameras: bool = False) -> Facts:
+def inspect(
+    sequence: Sequence,
+    samples: int | None = 50,
+    is_quick: bool = False,
+    with_cameras: bool = False,
+    on_start: Callable[[str, int], None] = lambda stage, total: None,
+    on_step: Callable[[], None] = lambda: None,
+) -> Facts:
     """JSON-ready facts about `sequence`; point statistics come from `samples` scans spread evenly, all when None.
 
     `findings` are the faults: `code`, `what`, `way_out`; `problems` the same as sentences. Unreadable scans are
     among them. With `is_quick` no scan is registered, so the IMU's clock and axes are not compared with the scans, and
     no clock of points without times is sought. With `with_cameras` cameras are checked against the scans, which are registered
     for it; raises InputError where there is none.
+    on_start(stage, number of its scans, 0 without any), then on_step() per scan
     """
     findings = Findings(Finding("recording", sentence) for sentence in sequence.problems)
     n = len(sequence)
     count = n if samples is None else min(n, samples)
     indices = np.unique(np.linspace(0, n - 1, count).round().astype(int)) if n else np.zeros(0, int)
     time = examine_stamps(sequence, findings)
+    on_start("point times", 0)
     recording = with_point_times(sequence, PreprocessConfig(), is_stated_only=is_quick)
     notes = list(recording.notes)
-    points = examine_points(recording, indices, findings)
+    on_start("points", len(indices))
+    points = examine_points(recording, indices, findings, on_step)
+    on_start("sensors", 0)
     examine_times(recording, points, findings)
     rule, sentence = rings_rule(sequence)
     if sentence:
@@ -211,8 +222,10 @@ def examine_stamps(sequence: Sequence, findings: Findings) -> Facts:
     }
 
 
-def examine_points(sequence: Sequence, indices: NDArray[Any], findings: Findings) -> Facts:
-    """Statistics over the scans `indices`. Unreadable scans are counted, and a finding names the first of them."""
+def examine_points(
+    sequence: Sequence, indices: NDArray[Any], findings: Findings, on_step: Callable[[], None] = lambda: None
+) -> Facts:
+    """Statistics over the scans `indices`, `on_step` after each. Unreadable ones are counted, a finding names the first."""
     scans: list[Facts] = []
     unreadable: list[str] = []
     for index in indices:
@@ -220,6 +233,7 @@ def examine_points(sequence: Sequence, indices: NDArray[Any], findings: Findings
             scans.append(_scan_facts(sequence.scan(int(index))))
         except InputError as error:
             unreadable.append(str(error))
+        on_step()
     findings += [Finding("scan-unreadable", f"scan cannot be read: {sentence}") for sentence in unreadable[:3]]
     if len(unreadable) > 3:
         more = f"{len(unreadable) - 3} more of the {len(indices)} scans looked at cannot be read"
