@@ -225,7 +225,7 @@ def test_served_a_known_pair_mends_the_run(browser: Any, url: str, lost: Path) -
     assert not find(browser, "[data-file]").is_displayed()
     until(browser, lambda: find(browser, "[data-graph=run]").is_displayed())
     # Nearer, finer nodes of the map are drawn, and points of them are picked.
-    until(browser, lambda: "more are drawn" in find(browser, ".tiles-said").text)
+    until(browser, lambda: "points are loaded" in find(browser, ".tiles-said").text)
     browser.execute_script("mapView.zoom(20)")
     until(
         browser,

@@ -63,7 +63,7 @@ export class Tiles {
     this.forget();
     this.loadSome();
     const points = there.reduce((sum, name) => sum + this.tree.nodes[name], 0);
-    this.said.textContent = `Of all ${this.tree.points.toLocaleString("en")} points ${points.toLocaleString("en")} more are drawn, nearer ones as they are seen.`;
+    this.said.textContent = `${points.toLocaleString("en")} of all ${this.tree.points.toLocaleString("en")} points are loaded, nearer ones as they are seen.`;
   }
 
   /** m between points where nodes `there` are drawn: that of the finest, and not less than that of the whole map, which is of surfaces. */
