@@ -269,6 +269,7 @@ def test_installers_of_programs_install_a_command_that_runs(
     assert json.loads(run.stdout)["manifest"]["counts"]["ok"] == 5
 
 
+@pytest.mark.slow
 def test_a_wheel_needs_no_checkout_for_the_demo(tmp_path: Path) -> None:
     """Its libraries are those of the tests, which are first asked for lslam: what the wheel lacks is missing here."""
     source, site = tmp_path / "source", tmp_path / "site"

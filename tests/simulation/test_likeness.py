@@ -22,6 +22,7 @@ from lslam.simulation.scenarios import simulate
 Floats = NDArray[np.float64]
 Scans = list[Scan]
 
+SHARES_TOWNS = True
 ALIKE = 0.25  # the most that a mean may differ
 ROUGHLY = 0.4  # from the drive that nothing was made to resemble
 RANGES = [0, 5, 7.5, 10, 15, 20, 30, 80]  # m

@@ -18,6 +18,7 @@ from lslam.simulation.scenarios import SimulatedDrive, simulate
 from lslam.simulation.scene_mesh import MeshBuilder, RayScene, Surface
 from lslam.simulation.town import Network
 
+SHARES_TOWNS = True
 GROUND = (Surface.ROAD, Surface.PAVEMENT, Surface.LAWN)
 
 
