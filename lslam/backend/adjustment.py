@@ -7,7 +7,7 @@ linearly from one pose to the next, so that the motion within a sweep is correct
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -48,6 +48,7 @@ class AdjustmentLevel:
 # Walls that lie apart are brought together first, by knots so few that nothing else is changed; then every pose.
 LEVELS = (AdjustmentLevel(10, 0.02, 0.02, True, 8, 5e-3), AdjustmentLevel(1, 0.005, 1.5e-3, False, 4, 5e-4))
 NO_NUMBERS: Longs = np.zeros(0, np.int64)
+NO_POINTS: Floats = np.zeros((0, 3))
 ONE_DRIVE: Longs = np.zeros(1, np.int64)
 # Conjugate gradients: steps at most, and the part of the first residual that ends them.
 STEPS, ACCURACY = 300, 1e-4
@@ -74,39 +75,32 @@ class SweptPoints:
         """Points (N, 3) measured at `times` (N,), s, by a sensor whose poses have the ascending `stamps` (K,), s."""
         order = np.argsort(times, kind="stable")
         points, times = points[order], times[order]
-        at = np.clip(np.searchsorted(stamps, times, side="right") - 1, 0, len(stamps) - 1)
-        after = np.minimum(at + 1, len(stamps) - 1)
-        gap = np.where(after > at, stamps[after] - stamps[at], np.inf)
-        return cls(points, at, np.clip((times - stamps[at]) / gap, 0.0, 1.0))
+        return cls(points, *plane_adjustment.place_between(times, stamps))
 
     @classmethod
-    def chain(cls, parts: Sequence[SweptPoints], firsts: Longs) -> SweptPoints:
+    def chain(cls, parts: Iterable[SweptPoints], firsts: Longs) -> SweptPoints:
         """Points of several drives, one behind the other; firsts : (S,) number of the first pose of each."""
-        poses = [part.poses + first for part, first in zip(parts, firsts.tolist(), strict=True)]
-        points, shares = ([getattr(part, name) for part in parts] for name in ("points", "shares"))
-        return cls(np.concatenate(points), np.concatenate(poses), np.concatenate(shares))
+        own = [replace(part, poses=part.poses + first) for part, first in zip(parts, firsts.tolist(), strict=True)]
+        if len(own) == 1:
+            return own[0]
+        return cls(*(np.concatenate([getattr(part, name) for part in own]) for name in ("points", "poses", "shares")))
 
     def on_knots(self, knots: Longs) -> SweptPoints:
         """The same points between the poses of numbers `knots` (M,) alone, the first and the last of all among them."""
-        place = self.poses + self.shares
-        at = np.searchsorted(knots, place, side="right") - 1
-        after = np.minimum(at + 1, len(knots) - 1)
-        gap = np.maximum(knots[after] - knots[at], 1)
-        return SweptPoints(self.points, at, (place - knots[at]) / gap)
+        places = plane_adjustment.place_between(self.poses + self.shares, knots.astype(np.float64))
+        return SweptPoints(self.points, *places)
 
-    def move(self, poses: Floats, corrections: Floats) -> Floats:
-        """The points (N, 3) after `corrections` (K, 6) of the `poses` (K, 4, 4)."""
+    def move(self, poses: Floats, corrections: Floats) -> None:
+        """Move the points (N, 3), in place, by `corrections` (K, 6) of the `poses` (K, 4, 4)."""
         origins, turns = np.ascontiguousarray(poses[:, :3, 3]), so3.exp(corrections[:, 3:])
-        points = np.ascontiguousarray(self.points)
-        return plane_adjustment.move(points, self.poses, self.shares, origins, turns, corrections[:, :3].copy())
+        plane_adjustment.move(self.points, self.poses, self.shares, origins, turns, corrections[:, :3].copy())
 
 
 @dataclass(frozen=True)
 class Adjustment:
-    """poses : (K, 4, 4); points : (N, 3) m, moved with them; rounds : how often planes were looked for."""
+    """poses : (K, 4, 4); rounds : how often planes were looked for."""
 
     poses: Floats
-    points: Floats
     rounds: int
 
 
@@ -122,7 +116,8 @@ def adjust(
 
     prior : information about some poses; numbers : (K,) their indices in it, -1 for poses without
     firsts : (S,) index of the first pose of each drive, which no motion joins to the pose before
-    All points move with the poses. Without a prior that fixes the poses as a whole, the mean correction is about zero.
+    All points of `sweep` are moved with the poses, in place. Without a prior that fixes the poses as a whole, the mean
+    correction is about zero.
     """
     rounds, ends = 0, np.append(firsts[1:], len(poses))
     for level in LEVELS:
@@ -130,30 +125,31 @@ def adjust(
             np.concatenate([np.append(np.arange(a, b, level.scans), b - 1) for a, b in zip(firsts, ends, strict=True)])
         )
         is_step = ~np.isin(knots[1:], firsts)
-        places = SweptPoints(poses[:, :3, 3], np.arange(len(poses)), np.zeros(len(poses))).on_knots(knots)
+        places = SweptPoints(NO_POINTS, np.arange(len(poses)), np.zeros(len(poses))).on_knots(knots)
         total = np.zeros((len(knots), 6))
         for _ in checking(range(level.rounds)):
-            seen = sweep.on_knots(knots)
             on_knots = None if prior is None else _knot_prior(prior, numbers, poses, places, poses[knots])
-            corrections = _corrections(poses[knots], seen.select(mask), level, total, is_step, on_knots)
-            if corrections is None:
+            sightings = _sightings(sweep.select(mask).on_knots(knots), level.flatness)
+            if sightings is None:
                 break
+            corrections = _corrections(poses[knots], sightings, level, total, is_step, on_knots)
             if not level.is_free:
                 total += corrections
-            sweep = replace(sweep, points=seen.move(poses[knots], corrections))
+            sweep.on_knots(knots).move(poses[knots], corrections)
             poses = _move_poses(poses, places, poses[knots], corrections)
-            places = replace(places, points=poses[:, :3, 3])
             rounds += 1
             if float(np.sqrt(np.mean(np.sum(corrections[:, :3] ** 2, axis=1)))) < level.settled_m:
                 break
-    return Adjustment(poses, sweep.points, rounds)
+    return Adjustment(poses, rounds)
 
 
 def _move_poses(poses: Floats, places: SweptPoints, knots: Floats, corrections: Floats) -> Floats:
     """The `poses` (K, 4, 4) at `places` after `corrections` (M, 6) of the poses `knots` (M, 4, 4)."""
     after, share = np.minimum(places.poses + 1, len(knots) - 1), places.shares[:, None]
     turns = (1.0 - share) * corrections[places.poses, 3:] + share * corrections[after, 3:]
-    return se3.normalise(se3.make(so3.exp(turns) @ poses[:, :3, :3], places.move(knots, corrections)))
+    positions = poses[:, :3, 3].copy()
+    replace(places, points=positions).move(knots, corrections)
+    return se3.normalise(se3.make(so3.exp(turns) @ poses[:, :3, :3], positions))
 
 
 @dataclass(frozen=True)
@@ -206,29 +202,49 @@ def _knot_prior(prior: PosePrior, numbers: Longs, poses: Floats, places: SweptPo
     return _KnotPrior(prior, which, at, shares[..., None, None] * J, noise.changes(prior.poses[which], poses[own]))
 
 
-def _corrections(
-    poses: Floats, sweep: SweptPoints, level: AdjustmentLevel, total: Floats, is_step: Bools, prior: _KnotPrior | None
-) -> Floats | None:
-    """(K, 6) corrections of one Gauss-Newton step, solved by conjugate gradients; None when no plane is found.
+@dataclass(frozen=True)
+class _Sightings:
+    """What each scan saw of each plane, plane after plane.
 
-    total : (K, 6) corrections so far, for the smoothness term; is_step : (K - 1,) whether motion joins a pose to the next
-    prior : information about some poses
+    starts : (V + 1,) first sighting of each plane; poses, shares : (C,) as of swept points, in the mean
+    means, covariances : (C, 3), (C, 3, 3) of their points, m and m2, world
     """
-    planes = find_planes(sweep.points, sweep.poses, level.flatness)
-    on_plane = planes >= 0
-    if not on_plane.any():
+
+    starts: Longs
+    poses: Longs
+    shares: Floats
+    means: Floats
+    covariances: Floats
+
+
+def _sightings(sweep: SweptPoints, flatness: float) -> _Sightings | None:
+    """Sightings of the planes that the points of `sweep` lie on; None when there is no plane."""
+    planes = find_planes(sweep.points, sweep.poses, flatness)
+    order = np.flatnonzero(planes >= 0)
+    if not len(order):
         return None
-    planes, sweep = planes[on_plane], sweep.select(on_plane)
-    order = np.argsort(planes, kind="stable")
+    order = order[np.argsort(planes[order], kind="stable")]
     planes, at = planes[order], sweep.poses[order]
     is_first = np.append(True, (np.diff(planes) != 0) | (np.diff(at) != 0))
     sighting = np.cumsum(is_first) - 1
     numbers, means, covariances = plane_adjustment.sums(sighting, int(sighting[-1]) + 1, sweep.points[order])
     shares = np.bincount(sighting, sweep.shares[order]) / numbers
     seen = planes[is_first]
-    starts, first = np.searchsorted(seen, np.arange(int(seen[-1]) + 2)), at[is_first]
-    H, beside, g, coupling, own = plane_adjustment.equations(
-        starts, first, shares, means, covariances, np.ascontiguousarray(poses[:, :3, 3]), FLOOR_M**2
+    return _Sightings(np.searchsorted(seen, np.arange(int(seen[-1]) + 2)), at[is_first], shares, means, covariances)
+
+
+def _corrections(
+    poses: Floats, seen: _Sightings, level: AdjustmentLevel, total: Floats, is_step: Bools, prior: _KnotPrior | None
+) -> Floats:
+    """(K, 6) corrections of one Gauss-Newton step, solved by conjugate gradients.
+
+    total : (K, 6) corrections so far, for the smoothness term; is_step : (K - 1,) whether motion joins a pose to the next
+    prior : information about some poses
+    """
+    origins = np.ascontiguousarray(poses[:, :3, 3])
+    sightings = seen.starts, seen.poses, seen.shares, seen.means
+    H, beside, g, normals, planes, slopes = plane_adjustment.equations(
+        *sightings, seen.covariances, origins, FLOOR_M**2
     )
 
     stiff = np.repeat([level.step_m**-2, (level.step_m / LEVER_M) ** -2], 3)
@@ -236,7 +252,7 @@ def _corrections(
 
     def product(x: Floats) -> Floats:
         out = np.empty_like(x)
-        plane_adjustment.product(x, H, beside, starts, first, coupling, own, stiffness, out)
+        plane_adjustment.product(x, H, beside, *sightings, origins, normals, planes, slopes, stiffness, out)
         return out if prior is None else out + prior.product(x)
 
     diagonal = H + np.diag(2.0 * stiff) + (0.0 if prior is None else prior.blocks(len(H)))
@@ -280,10 +296,12 @@ def find_planes(points: Floats, poses: Longs, flatness: float) -> Longs:
     for edge in EDGES_M:
         some = points[left]
         cells, scans = plane_adjustment.number_cells(some, poses[left], edge)
-        numbers, _, covariances = plane_adjustment.sums(cells, len(scans), some)
+        is_plane = (np.bincount(cells) >= LEAST_POINTS) & (scans >= LEAST_SCANS)
+        # Of most cells nothing more is needed.
+        places = np.where(is_plane, np.cumsum(is_plane) - 1, -1)
+        _, _, covariances = plane_adjustment.sums(places[cells], int(is_plane.sum()), some)
         thin, narrow, _ = plane_adjustment.spectra(covariances).T
-        is_plane = (numbers >= LEAST_POINTS) & (scans >= LEAST_SCANS)
-        is_plane &= (thin < flatness * narrow) & (narrow > (LEAST_BREADTH * edge) ** 2)
+        is_plane[is_plane] = (thin < flatness * narrow) & (narrow > (LEAST_BREADTH * edge) ** 2)
         planes[left] = np.where(is_plane, count + np.cumsum(is_plane) - 1, -1)[cells]
         count += int(is_plane.sum())
         left = left[planes[left] < 0]

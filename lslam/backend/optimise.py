@@ -331,9 +331,9 @@ def _plane_variances(store: KeyframeStore, poses: Floats) -> tuple[Floats, NDArr
     clouds = [store.points(k) for k in range(len(poses))]
     step = 1 + sum(map(len, clouds)) // POINTS
     parts = [se3.apply(T, cloud[::step]) for T, cloud in zip(poses, clouds, strict=True)]
-    owner = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+    points, owner = np.concatenate(parts), np.repeat(np.arange(len(parts)), [len(part) for part in parts])
     queries = slice(None, None, max(1, -(-len(owner) // SAMPLES)))
-    return plane_variances(np.concatenate(parts), queries), owner[queries]
+    return plane_variances(points, points[queries]), owner[queries]
 
 
 def fixes_against_points(fixes: Fixes, points: Many[ControlPoint], georeference: Georeference) -> str:

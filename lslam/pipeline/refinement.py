@@ -28,7 +28,7 @@ from lslam.pipeline.map_pass import course_of, motion_within, scans_again, witho
 from lslam.pipeline.watch import Watch
 from lslam.registration.preprocessing.deskew import deskew_points
 
-# Points of a scan at most, and of all scans: about 300 bytes each while planes are adjusted. Odometry averages over all points,
+# Points of a scan at most, and of all scans: about 150 bytes each while planes are adjusted. Odometry averages over all points,
 # which fewer single ones do not beat.
 OF_A_SCAN, OF_ALL = 10_000, 6_000_000
 CELL_M = 2.0  # m, edge of the cells of which every second one is kept out of the adjustment
@@ -96,25 +96,28 @@ def refine(
     if min(map(len, nodes)) < 2:
         return {"is_taken": False, "why": "fewer than two scans are registered"}, None
     of_a_scan = max(1, min(OF_A_SCAN, OF_ALL // sum(map(len, nodes))))
-    clouds = [_read_points(drive, own, of_a_scan, watch) for drive, own in zip(drives, nodes, strict=True)]
-    if not any(len(cloud.points) for cloud in clouds):
+    firsts = np.cumsum([0, *map(len, nodes)])
+    parts = (_read_points(drive, own, of_a_scan, watch) for drive, own in zip(drives, nodes, strict=True))
+    cloud = SweptPoints.chain(parts, firsts[:-1])
+    if not len(cloud.points):
         return {"is_taken": False, "why": "no point lies within the range of the map"}, None
     with asking(watch.should_stop, INTERRUPTED):
-        return _adjustment(drives, clouds, prior, keyframes, prior_map)
+        return _adjustment(drives, cloud, prior, keyframes, prior_map)
 
 
 def _read_points(drive: PosedDrive, nodes: Longs, of_a_scan: int, watch: Watch) -> SweptPoints:
     """Points of the scans `nodes` (K,) in the world, each between the two poses before and after its instant."""
-    own, parts = [drive.results[k] for k in nodes], list[tuple[Floats, Floats]]()
+    own = [drive.results[k] for k in nodes]
     prepare, numbers = _poser(drive.config, own, of_a_scan), range(len(drive.results))
+    # Filled in place: joined from parts, they would be in memory twice.
+    points, times, count = np.empty((len(own) * of_a_scan, 3)), np.empty(len(own) * of_a_scan), 0
     for _, loaded in scans_again(drive.sequence, prepare, numbers, drive.config, watch, INTERRUPTED):
         if loaded.prepared is not None:
-            parts.append(loaded.prepared)
-    if not parts:
-        return SweptPoints(np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros(0))
-    points, times = (np.concatenate(of) for of in zip(*parts, strict=True))
+            after = count + len(loaded.prepared[1])
+            points[count:after], times[count:after] = loaded.prepared
+            count = after
     stamps = np.array([result.stamp_ns for result in own], np.int64)
-    return SweptPoints.at_times(points, times, 1e-9 * (stamps - stamps[0]))
+    return SweptPoints.at_times(points[:count], times[:count], 1e-9 * (stamps - stamps[0]))
 
 
 def _poser(config: Config, results: list[ScanResult], count: int) -> Callable[[Scan], tuple[Floats, Floats] | None]:
@@ -141,12 +144,12 @@ def _poser(config: Config, results: list[ScanResult], count: int) -> Callable[[S
 
 def _adjustment(
     drives: Sequence[PosedDrive],
-    clouds: list[SweptPoints],
+    cloud: SweptPoints,
     prior: PosePrior | None,
     keyframes: Longs,
     prior_map: Floats | None,
 ) -> tuple[dict[str, Any], list[list[ScanResult]] | None]:
-    """As `refine`, of the points that were read of each drive."""
+    """As `refine`, of the points that were read of the drives, which are moved."""
     nodes = [drive.nodes for drive in drives]
     firsts = np.cumsum([0, *map(len, nodes)])
     count = int(firsts[-1])
@@ -159,23 +162,23 @@ def _adjustment(
     if prior_map is not None:
         # One more scan, whose pose is known.
         poses = np.concatenate([before, se3.make(np.eye(3), prior_map.mean(axis=0))[None]])
-        clouds = [*clouds, SweptPoints(prior_map, np.zeros(len(prior_map), np.int64), np.zeros(len(prior_map)))]
+        as_scan = SweptPoints(prior_map, np.zeros(len(prior_map), np.int64), np.zeros(len(prior_map)))
+        cloud = SweptPoints.chain([cloud, as_scan], np.array([0, count]))
         prior, numbers = (
             PosePrior(poses[-1:], lambda x: MAP_INFORMATION * x, MAP_INFORMATION * np.eye(6)[None]),
             np.array([count]),
         )
-    begins = firsts[: len(clouds)]
-    cloud = SweptPoints.chain(clouds, begins)
-    is_even = np.floor(cloud.points / CELL_M).astype(np.int64).sum(axis=1) % 2 == 0
-    result = adjust(poses, cloud, is_even, prior, numbers, begins)
-    others = cloud.select(~is_even)
-    driven = int(np.searchsorted(others.poses, count))
-    queries = slice(0, driven, max(1, -(-driven // JUDGES)))
-    thick = [plane_variances(np.ascontiguousarray(p), queries) for p in (others.points, result.points[~is_even])]
+    begins = firsts[: len(drives) + (prior_map is not None)]
+    is_kept_out = _checkerboard(cloud.points)
+    judges = np.flatnonzero(is_kept_out & (cloud.poses < count))
+    judges = judges[:: max(1, -(-len(judges) // JUDGES))]
+    scans, cells = cloud.poses[judges], np.floor(cloud.points[judges] / CELL_M).astype(np.int64)
+    thick = [plane_variances(cloud.points[is_kept_out], cloud.points[judges])]
+    result = adjust(poses, cloud, ~is_kept_out, prior, numbers, begins)
+    thick.append(plane_variances(cloud.points[is_kept_out], cloud.points[judges]))
     gain = 0.5 * np.log(np.maximum(thick[1], 1e-12) / np.maximum(thick[0], 1e-12))
-    cells = np.floor(others.points[queries] / CELL_M).astype(np.int64)
-    is_better = thinner_windows(gain, others.poses[queries], cells, count)
-    is_judge = np.isfinite(gain) & is_better[others.poses[queries]]
+    is_better = thinner_windows(gain, scans, cells, count)
+    is_judge = np.isfinite(gain) & is_better[scans]
     facts: dict[str, Any] = {"is_taken": bool(is_better.any()), "scans": int(is_better.sum()), "rounds": result.rounds}
     if not is_better.any():
         return {**facts, "why": "planes of the points kept out do not get thinner"}, None
@@ -192,6 +195,14 @@ def _adjustment(
     }
     parts = zip(drives, nodes, *(np.split(array, firsts[1:-1]) for array in (is_better, after)), strict=True)
     return facts, [_bend(drive.results, own[taken], refined[taken]) for drive, own, taken, refined in parts]
+
+
+def _checkerboard(points: Floats) -> Bools:
+    """(N,) whether each point (N, 3) lies in one of every second cell."""
+    total = np.zeros(len(points), np.int64)
+    for axis in range(3):
+        total += np.floor(points[:, axis] / CELL_M).astype(np.int64)
+    return np.asarray(total % 2 == 1)
 
 
 def _bend(results: list[ScanResult], numbers: Longs, poses: Floats) -> list[ScanResult]:

@@ -29,7 +29,8 @@ def test_the_reduced_equations_are_those_of_all_points_with_the_plane_eliminated
     starts, at = np.array([0, 4]), np.array([k for k, _ in sightings])
     shares = np.array([share for _, share in sightings])
     floor = 1e-4
-    H, beside, g, coupling, planes = plane_adjustment.equations(starts, at, shares, means, covariances, origins, floor)
+    seen = starts, at, shares, means
+    H, beside, g, *of_planes = plane_adjustment.equations(*seen, covariances, origins, floor)
 
     everything = np.concatenate(points)
     middle = everything.mean(axis=0)
@@ -50,7 +51,7 @@ def test_the_reduced_equations_are_those_of_all_points_with_the_plane_eliminated
     steps = np.array([[[1, -1, 0], [-1, 1, 0], [0, 0, 0]], [[0, 0, 0], [0, 1, -1], [0, -1, 1]]])
     chain = sum(np.kron(step, np.diag(stiff)) for step, stiff in zip(steps, stiffness, strict=True))
     x, out = rng.normal(size=(3, 6)), np.empty((3, 6))
-    plane_adjustment.product(x, H, beside, starts, at, coupling, planes, stiffness, out)
+    plane_adjustment.product(x, H, beside, *seen, origins, *of_planes, stiffness, out)
     np.testing.assert_allclose(out.ravel(), (whole + chain) @ x.ravel(), rtol=1e-8, atol=1e-6)
     np.testing.assert_allclose(g.ravel(), right, rtol=1e-8, atol=1e-8)
 
@@ -111,10 +112,11 @@ def test_two_drives_of_one_room_come_together(seed: int) -> None:
     firsts = np.array([0, 40])
     cloud = SweptPoints.chain(swept, firsts)
     np.testing.assert_array_equal(cloud.poses, scans)
-    refined = adjust(drifted, cloud, np.ones(len(scans), bool), firsts=firsts)
+    again, mask = SweptPoints.chain(swept, firsts), np.ones(len(scans), bool)
+    refined = adjust(drifted, cloud, mask, firsts=firsts)
     assert ate(refined.poses, truth) < 0.005
     # As one drive, the step from the end of the first to the begin of the second would have to stay as it is.
-    assert ate(adjust(drifted, cloud, np.ones(len(scans), bool)).poses, truth) > 2.0 * ate(refined.poses, truth)
+    assert ate(adjust(drifted, again, mask).poses, truth) > 2.0 * ate(refined.poses, truth)
 
 
 def test_points_move_with_the_poses_round_the_instant_they_were_measured() -> None:
@@ -125,7 +127,8 @@ def test_points_move_with_the_poses_round_the_instant_they_were_measured() -> No
     np.testing.assert_allclose(swept.shares, [0.0, 0.0, 0.5, 0.0, 0.0])
     corrections = np.zeros((2, 6))
     corrections[1] = [0.2, 0, 0, 0, 0, np.pi / 2]
-    moved = swept.move(np.stack([np.eye(4), np.eye(4)]), corrections)
+    swept.move(np.stack([np.eye(4), np.eye(4)]), corrections)
+    moved = swept.points
     np.testing.assert_allclose(moved[[0, 3]], [[1, 0, 0], [0.2, 1, 0]], atol=1e-12)
     np.testing.assert_allclose(moved[2], [0.6, 0.5, 0], atol=1e-12)
 

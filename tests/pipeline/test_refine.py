@@ -113,10 +113,10 @@ def test_poses_in_frames_of_their_own_stay(monkeypatch: pytest.MonkeyPatch) -> N
     ]
     nodes, better, drives = [0, 1, 4, 5], poses.copy(), [PosedDrive(None, results, None)]  # type: ignore[arg-type]
     better[:, 1, 3] = 0.1 * np.arange(6)
-    monkeypatch.setattr(refinement, "adjust", lambda before, swept, *others: Adjustment(better[nodes], swept.points, 1))
+    monkeypatch.setattr(refinement, "adjust", lambda *all_of_it: Adjustment(better[nodes], 1))
     monkeypatch.setattr(refinement, "thinner_windows", lambda gain, scans, cells, count: np.ones(count, bool))
     swept = SweptPoints(np.random.default_rng(0).random((4000, 3)) * 4, np.zeros(4000, np.int64), np.zeros(4000))
-    facts, refined = refinement._adjustment(drives, [swept], None, np.zeros(0, np.int64), None)
+    facts, refined = refinement._adjustment(drives, swept, None, np.zeros(0, np.int64), None)
     assert refined is not None
     (moved,) = refined
     assert facts["scans"] == 4
@@ -139,7 +139,7 @@ def test_a_map_that_stays_draws_the_poses_into_its_frame(seed: int) -> None:
     results = [ScanResult(k, 10**8 * k, T) for k, T in enumerate(located)]
     drives = [PosedDrive(None, results, None)]  # type: ignore[arg-type]
     for known, most in ((prior_map, 0.01), (None, np.inf)):
-        facts, refined = refinement._adjustment(drives, [swept], None, np.zeros(0, np.int64), known)
+        facts, refined = refinement._adjustment(drives, swept, None, np.zeros(0, np.int64), known)
         assert facts["is_taken"]
         assert refined is not None
         away = np.stack([result.T_world_lidar for result in refined[0]])[:, :3, 3] - truth[:, :3, 3]

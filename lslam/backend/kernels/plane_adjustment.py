@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.core.kernels.jit import inline_with_arrays, kernel
+from lslam.core.kernels.jit import inline, inline_with_arrays, kernel
 from lslam.core.kernels.linalg import eigen, inverse
 from lslam.core.kernels.voxel import index_of, pack, place_of, table_size
 
@@ -48,31 +48,53 @@ def number_cells(points: Floats, poses: Longs, edge: float) -> tuple[Longs, Long
 
 
 @kernel
-def move(points: Floats, poses: Longs, shares: Floats, origins: Floats, turns: Floats, shifts: Floats) -> Floats:
-    """Points (N, 3) moved by the corrections of the two poses before and after each, interpolated.
+def place_between(places: Floats, nodes: Floats) -> tuple[Longs, Floats]:
+    """Index (N,) of the last of the ascending `nodes` (M,) before each place (N,), and its share (N,) 0..1 of the way onwards.
+
+    Places before the first node are at it, those behind the last at the last.
+    """
+    numbers, shares = np.empty(len(places), np.int64), np.zeros(len(places))
+    for i in range(len(places)):
+        at = max(np.searchsorted(nodes, places[i], side="right") - 1, 0)
+        numbers[i] = at
+        if at + 1 < len(nodes):
+            shares[i] = min(max((places[i] - nodes[at]) / (nodes[at + 1] - nodes[at]), 0.0), 1.0)
+    return numbers, shares
+
+
+@kernel
+def move(points: Floats, poses: Longs, shares: Floats, origins: Floats, turns: Floats, shifts: Floats) -> None:
+    """Move the points (N, 3), in place, by the corrections of the two poses before and after each, interpolated.
 
     poses : (N,) index of the earlier pose; shares : (N,) 0..1 of the way from it to the later
     origins : (K, 3) m, of the sensor; turns : (K, 3, 3) about these; shifts : (K, 3) m
     """
-    out = np.zeros_like(points)
+    out = np.empty(3)
     last = len(origins) - 1
     for i in range(len(points)):
+        out[:] = 0.0
         for side in range(2):
             k = min(poses[i] + side, last)
             share = shares[i] if side else 1.0 - shares[i]
             x, y, z = points[i, 0] - origins[k, 0], points[i, 1] - origins[k, 1], points[i, 2] - origins[k, 2]
             for a in range(3):
                 turned = turns[k, a, 0] * x + turns[k, a, 1] * y + turns[k, a, 2] * z
-                out[i, a] += share * (turned + origins[k, a] + shifts[k, a])
-    return out
+                out[a] += share * (turned + origins[k, a] + shifts[k, a])
+        for a in range(3):
+            points[i, a] = out[a]
 
 
 @kernel
 def sums(cells: Longs, count: int, points: Floats) -> tuple[Longs, Floats, Floats]:
-    """Number (V,), mean (V, 3) and covariance (V, 3, 3) of the points (N, 3) in each of `count` cells; `cells` (N,) numbers."""
+    """Number (V,), mean (V, 3) and covariance (V, 3, 3) of the points (N, 3) in each of `count` cells.
+
+    cells : (N,) index of the cell of each point, -1 for none
+    """
     numbers, means, covariances = np.zeros(count, np.int64), np.zeros((count, 3)), np.zeros((count, 3, 3))
     for i in range(len(cells)):
         v = cells[i]
+        if v < 0:
+            continue
         numbers[v] += 1
         for a in range(3):
             means[v, a] += points[i, a]
@@ -81,6 +103,8 @@ def sums(cells: Longs, count: int, points: Floats) -> tuple[Longs, Floats, Float
             means[v, a] /= max(numbers[v], 1)
     for i in range(len(cells)):
         v = cells[i]
+        if v < 0:
+            continue
         for a in range(3):
             for b in range(3):
                 covariances[v, a, b] += (points[i, a] - means[v, a]) * (points[i, b] - means[v, b])
@@ -117,10 +141,65 @@ def lever(n: Floats, mean: Floats, origin: Floats, out: Floats) -> None:
     out[3], out[4], out[5] = y * n[2] - z * n[1], z * n[0] - x * n[2], x * n[1] - y * n[0]
 
 
+@inline
+def couple(
+    shares: Floats,
+    poses: Longs,
+    means: Floats,
+    origins: Floats,
+    slopes: Floats,
+    n: Floats,
+    c: int,
+    x: Floats,
+    z: Floats,
+) -> None:
+    """Add to `z` (3,) the effect of the pose corrections x (K, 6) on a plane of normal `n`, by sighting `c`, unweighted."""
+    for side in range(2):
+        share = shares[c] if side else 1.0 - shares[c]
+        if share == 0.0:
+            continue
+        k = poses[c] + side
+        dx, dy, dz = means[c, 0] - origins[k, 0], means[c, 1] - origins[k, 1], means[c, 2] - origins[k, 2]
+        a, b, d = x[k, 3], x[k, 4], x[k, 5]
+        r = n[0] * x[k, 0] + n[1] * x[k, 1] + n[2] * x[k, 2]
+        r += (dy * n[2] - dz * n[1]) * a + (dz * n[0] - dx * n[2]) * b + (dx * n[1] - dy * n[0]) * d
+        z[0] += share * r
+        z[1] += share * (r * slopes[c, 0] + slopes[c, 2] * a + slopes[c, 3] * b + slopes[c, 4] * d)
+        z[2] += share * (r * slopes[c, 1] + slopes[c, 5] * a + slopes[c, 6] * b + slopes[c, 7] * d)
+
+
+@inline
+def couple_back(
+    shares: Floats,
+    poses: Longs,
+    means: Floats,
+    origins: Floats,
+    slopes: Floats,
+    n: Floats,
+    c: int,
+    y: Floats,
+    out: Floats,
+) -> None:
+    """Subtract from `out` (K, 6) the effect of the plane correction y (3,) on the poses of sighting `c`: `couple` transposed."""
+    force = y[0] + slopes[c, 0] * y[1] + slopes[c, 1] * y[2]
+    for side in range(2):
+        share = shares[c] if side else 1.0 - shares[c]
+        if share == 0.0:
+            continue
+        k = poses[c] + side
+        dx, dy, dz = means[c, 0] - origins[k, 0], means[c, 1] - origins[k, 1], means[c, 2] - origins[k, 2]
+        f = share * force
+        for a in range(3):
+            out[k, a] -= f * n[a]
+        out[k, 3] -= f * (dy * n[2] - dz * n[1]) + share * (slopes[c, 2] * y[1] + slopes[c, 5] * y[2])
+        out[k, 4] -= f * (dz * n[0] - dx * n[2]) + share * (slopes[c, 3] * y[1] + slopes[c, 6] * y[2])
+        out[k, 5] -= f * (dx * n[1] - dy * n[0]) + share * (slopes[c, 4] * y[1] + slopes[c, 7] * y[2])
+
+
 @kernel
 def equations(
     starts: Longs, poses: Longs, shares: Floats, means: Floats, covariances: Floats, origins: Floats, floor: float
-) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
     """Normal equations of the poses, and their coupling with the planes, which are eliminated.
 
     starts : (V + 1,) first sighting of each plane; poses : (C,) the first of both poses of a sighting
@@ -128,12 +207,14 @@ def equations(
     origins : (K, 3) m, of the sensor; floor : m2, added to the variance about a plane
 
     Every sighting is one measurement of the variance about its plane: its points have errors in common.
-    Returns blocks (K, 6, 6) on the diagonal and (K, 6, 6) beside it, gradient (K, 6), coupling (C, 2, 6, 3) of the sightings with
-    the planes, and the inverse (V, 3, 3) of the planes' own blocks.
+    Returns blocks (K, 6, 6) on the diagonal and (K, 6, 6) beside it, gradient (K, 6), normals (V, 3) of the planes, inverse
+    (V, 3, 3) of the planes' own blocks times their squared weights, and `slopes` (C, 8): two coordinates in its plane, m, of
+    each sighting, and two moments (3,) of its points about their mean, m2. Coupling blocks, of 36 numbers, are made of these.
     """
     count = len(origins)
     H, beside, g = np.zeros((count, 6, 6)), np.zeros((count, 6, 6)), np.zeros((count, 6))
-    coupling, planes = np.zeros((len(poses), 2, 6, 3)), np.zeros((len(starts) - 1, 3, 3))
+    slopes = np.empty((len(poses), 8))
+    normals, planes = np.empty((len(starts) - 1, 3)), np.empty((len(starts) - 1, 3, 3))
     A, Q, own = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     d, J = np.empty(3), np.empty((2, 6))
     K, pull, Cn, turned = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
@@ -153,6 +234,7 @@ def equations(
         values, axes = eigen(A)
         order = np.argsort(values)
         n, u, w = axes[:, order[0]].copy(), axes[:, order[1]].copy(), axes[:, order[2]].copy()
+        normals[v] = n
         weight = 1.0 / (max(values[order[0]], 0.0) + floor)
         own[:] = 0.0
         pull[:] = 0.0
@@ -165,7 +247,10 @@ def equations(
             for a in range(3):
                 Cn[a] = C[a, 0] * n[0] + C[a, 1] * n[1] + C[a, 2] * n[2]
             across(n, C, Q)
+            slopes[c, 0], slopes[c, 1] = K[1], K[2]
             for a in range(3):
+                slopes[c, 2 + a] = Q[a, 0] * u[0] + Q[a, 1] * u[1] + Q[a, 2] * u[2]
+                slopes[c, 5 + a] = Q[a, 0] * w[0] + Q[a, 1] * w[1] + Q[a, 2] * w[2]
                 turned[a] = Q[a, 0] * n[0] + Q[a, 1] * n[1] + Q[a, 2] * n[2]
             # Errors of the plane: offset, and slopes along u and w.
             uu = uw = ww = 0.0
@@ -193,13 +278,8 @@ def equations(
                 f = weight * share
                 for i in range(6):
                     g[k, i] += f * J[side, i] * r
-                    for j in range(3):
-                        coupling[c, side, i, j] = f * J[side, i] * K[j]
                 for a in range(3):
                     g[k, 3 + a] += f * turned[a]
-                    for b in range(3):
-                        coupling[c, side, 3 + a, 1] += f * Q[a, b] * u[b]
-                        coupling[c, side, 3 + a, 2] += f * Q[a, b] * w[b]
             for side in range(2):
                 for other in range(side, 2):
                     a_share = shares[c] if side else 1.0 - shares[c]
@@ -218,14 +298,13 @@ def equations(
                         block[3 + a, 5] += f * (n[1] * Q[a, 0] - n[0] * Q[a, 1])
         planes[v] = inverse(own)
         for i in range(3):
-            Cn[i] = planes[v, i, 0] * pull[0] + planes[v, i, 1] * pull[1] + planes[v, i, 2] * pull[2]
+            Cn[i] = weight * (planes[v, i, 0] * pull[0] + planes[v, i, 1] * pull[1] + planes[v, i, 2] * pull[2])
+        for i in range(3):
+            for j in range(3):
+                planes[v, i, j] *= weight * weight
         for c in range(first, last):
-            for side in range(2):
-                if poses[c] + side < count:
-                    for i in range(6):
-                        for j in range(3):
-                            g[poses[c] + side, i] -= coupling[c, side, i, j] * Cn[j]
-    return H, beside, g, coupling, planes
+            couple_back(shares, poses, means, origins, slopes, n, c, Cn, g)
+    return H, beside, g, normals, planes, slopes
 
 
 @kernel
@@ -235,14 +314,18 @@ def product(
     beside: Floats,
     starts: Longs,
     poses: Longs,
-    coupling: Floats,
+    shares: Floats,
+    means: Floats,
+    origins: Floats,
+    normals: Floats,
     planes: Floats,
+    slopes: Floats,
     stiffness: Floats,
     out: Floats,
 ) -> None:
     """Product of the reduced normal matrix with x (K, 6), into `out` (K, 6): the planes are eliminated.
 
-    stiffness : (K - 1, 6) of the difference of two successive corrections, 1/m2 and 1/rad2
+    stiffness : (K - 1, 6) of the difference of two successive corrections, 1/m2 and 1/rad2; others as of `equations`
     """
     count = len(x)
     for k in range(count):
@@ -261,19 +344,14 @@ def product(
                 out[k + 1, j] += beside[k, i, j] * x[k, i]
     z, y = np.empty(3), np.empty(3)
     for v in range(len(starts) - 1):
+        n = normals[v]
         z[:] = 0.0
         for c in range(starts[v], starts[v + 1]):
-            for side in range(min(2, count - poses[c])):
-                for i in range(6):
-                    for j in range(3):
-                        z[j] += coupling[c, side, i, j] * x[poses[c] + side, i]
+            couple(shares, poses, means, origins, slopes, n, c, x, z)
         for i in range(3):
             y[i] = planes[v, i, 0] * z[0] + planes[v, i, 1] * z[1] + planes[v, i, 2] * z[2]
         for c in range(starts[v], starts[v + 1]):
-            for side in range(min(2, count - poses[c])):
-                for i in range(6):
-                    for j in range(3):
-                        out[poses[c] + side, i] -= coupling[c, side, i, j] * y[j]
+            couple_back(shares, poses, means, origins, slopes, n, c, y, out)
 
 
 @kernel
