@@ -193,6 +193,8 @@ def _adjustment(
         "moved_rms_m": round(float(np.sqrt(np.mean(away**2))), 4),
         "moved_most_m": round(float(away.max()), 4),
     }
+    if prior_map is not None:  # that holds each pose by itself: what is not taken does not follow its neighbours
+        after, is_better = np.where(is_better[:, None, None], after, before), np.ones(count, bool)
     parts = zip(drives, nodes, *(np.split(array, firsts[1:-1]) for array in (is_better, after)), strict=True)
     return facts, [_bend(drive.results, own[taken], refined[taken]) for drive, own, taken, refined in parts]
 

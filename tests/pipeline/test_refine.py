@@ -114,7 +114,8 @@ def test_poses_in_frames_of_their_own_stay(monkeypatch: pytest.MonkeyPatch) -> N
     nodes, better, drives = [0, 1, 4, 5], poses.copy(), [PosedDrive(None, results, None)]  # type: ignore[arg-type]
     better[:, 1, 3] = 0.1 * np.arange(6)
     monkeypatch.setattr(refinement, "adjust", lambda *all_of_it: Adjustment(better[nodes], 1))
-    monkeypatch.setattr(refinement, "thinner_windows", lambda gain, scans, cells, count: np.ones(count, bool))
+    is_thinner = np.ones(4, bool)
+    monkeypatch.setattr(refinement, "thinner_windows", lambda gain, scans, cells, count: is_thinner)
     swept = SweptPoints(np.random.default_rng(0).random((4000, 3)) * 4, np.zeros(4000, np.int64), np.zeros(4000))
     facts, refined = refinement._adjustment(drives, swept, None, np.zeros(0, np.int64), None)
     assert refined is not None
@@ -122,6 +123,13 @@ def test_poses_in_frames_of_their_own_stay(monkeypatch: pytest.MonkeyPatch) -> N
     assert facts["scans"] == 4
     np.testing.assert_array_equal(moved[2].T_world_lidar, poses[2])
     np.testing.assert_allclose([moved[k].T_world_lidar for k in (0, 1, 3, 4, 5)], better[[0, 1, 3, 4, 5]], atol=1e-9)
+    # Of a drive whose last scans do not get thinner these follow; in a map they stay.
+    is_thinner[2:] = False
+    for known, last in ((None, better[1, :3, 3] + [4, 0, 0]), (swept.points, poses[5, :3, 3])):
+        _, refined = refinement._adjustment(drives, swept, None, np.zeros(0, np.int64), known)
+        assert refined is not None
+        np.testing.assert_allclose(refined[0][1].T_world_lidar, better[1], atol=1e-9)
+        np.testing.assert_allclose(refined[0][5].T_world_lidar[:3, 3], last, atol=1e-9)
 
 
 @pytest.mark.parametrize("seed", range(3))
