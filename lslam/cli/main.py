@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib import import_module
 from itertools import pairwise
 from typing import Any, NoReturn
@@ -167,7 +167,8 @@ def _fail(message: str, code: int) -> NoReturn:
     if to is not None:
         to.tell("error", text=message, exit_code=code)
     else:
-        click.echo(message if code == 130 else f"error: {message}", err=True)
+        with suppress(OSError):  # the terminal may be closed
+            click.echo(message if code == 130 else f"error: {message}", err=True)
     sys.exit(code)
 
 

@@ -179,3 +179,14 @@ def test_a_reader_that_has_left_is_no_error_for_help_either(words: tuple[str, ..
     with os.fdopen(writing, "wb") as nobody:
         done = subprocess.run([*COMMAND, *words], stdout=nobody, stderr=subprocess.PIPE, env=environment(), check=False)
     assert (done.returncode, done.stderr) == (0, b"")
+
+
+def test_an_error_that_nobody_reads_keeps_its_exit_code() -> None:
+    """As of `lslam view` whose terminal was closed."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    try:
+        done = subprocess.run([*COMMAND, "methods", "--no-such"], stderr=writer, stdout=subprocess.DEVNULL, check=False)
+    finally:
+        os.close(writer)
+    assert done.returncode == 2
