@@ -105,6 +105,8 @@ def test_a_comparison_is_short_and_begins_with_its_table_and_errors(browser: Any
     assert chart["y"] + chart["height"] < 1000
     assert stage["y"] + stage["height"] < 1100
     assert not find(browser, ".crops").is_displayed()
+    find(browser, "details:has(.crops) > summary").click()
+    assert find(browser, ".crops svg, .crops img").is_displayed()
 
 
 def test_its_table_is_sorted_by_mouse_and_keys(browser: Any, compared: Path) -> None:
