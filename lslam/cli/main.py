@@ -66,9 +66,9 @@ class LazyGroup(click.Group):
         return list(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """The sub-command, imported now."""
-        if cmd_name not in COMMANDS:
-            return None
+        """The sub-command, imported now; None for an unknown name."""
+        if cmd_name in self.commands or cmd_name not in COMMANDS:
+            return self.commands.get(cmd_name)
         command = import_module(f"lslam.cli.{cmd_name}").command
         assert isinstance(command, click.Command)
         return command
@@ -113,6 +113,17 @@ def _print_version(ctx: click.Context, _: click.Parameter, wants_version: bool) 
 )
 def cli() -> None:
     """Batch LiDAR SLAM: a recorded sequence goes in; a trajectory, a map and an honest report come out."""
+
+
+@cli.command("completion", epilog='Example: eval "$(lslam completion bash)"')
+@click.argument("shell", type=click.Choice(["bash", "zsh", "fish"]))
+def print_completion(shell: str) -> None:
+    """Print the completion script of SHELL."""
+    from click.shell_completion import get_completion_class
+
+    complete = get_completion_class(shell)
+    assert complete is not None
+    click.echo(complete(cli, {}, "lslam", "_LSLAM_COMPLETE").source())
 
 
 def main() -> NoReturn:

@@ -75,7 +75,7 @@ def standing(points: NDArray[np.float32], sensor: Floats, floors: Iterable[Floor
     return stands
 
 
-def things_of(points: NDArray[np.float32], subset: Bools) -> Longs:
+def label_objects(points: NDArray[np.float32], subset: Bools) -> Longs:
     """Object number of each of the `subset` points (N, 3), from 1, by connected squares; 0 for the others.
 
     points : as for `floor_of`; subset : (N,), within reach
@@ -256,8 +256,8 @@ class Cleaner:
         free, hit = self._votes(points, scan.T_world_lidar, others)
         moving = extend_to_cubes((free >= 1) & (free >= hit), points)
         # Somebody beside a wall is a thing once the wall, which others saw, is left aside; then the feet join.
-        moving = whole(moving, things_of(upright, moving | (free >= hit)), MOST_LEFT, LEAST_LEFT)
-        moving = whole(moving, things_of(upright, np.ones(len(points), np.bool_)), MOST, LEAST)
+        moving = whole(moving, label_objects(upright, moving | (free >= hit)), MOST_LEFT, LEAST_LEFT)
+        moving = whole(moving, label_objects(upright, np.ones(len(points), np.bool_)), MOST, LEAST)
         moves = np.zeros(len(stands), np.bool_)
         moves[stands] = moving
         return moves

@@ -98,8 +98,8 @@ class PointCollector:
         """
         with np.errstate(invalid="ignore", over="ignore"):
             # As the kernel of voxels does, so that both keep the same points.
-            away2 = np.square(points, dtype=np.float64).sum(axis=1)
-            kept = has_return(points) & (away2 >= self._near**2) & (away2 <= self._far**2)
+            ranges2 = np.square(points, dtype=np.float64).sum(axis=1)
+            kept = has_return(points) & (ranges2 >= self._near**2) & (ranges2 <= self._far**2)
             world = se3.apply(T_world_lidar, points[kept].astype(np.float64))
         inside = np.isfinite(world).all(axis=1)
         if self._crop is not None:

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lslam.maps.clean import ABOVE, GAP, REACH_M, SQUARE, Floor, floor_of, standing, things_of, whole
+from lslam.maps.clean import ABOVE, GAP, REACH_M, SQUARE, Floor, floor_of, label_objects, standing, whole
 
 SENSOR = np.array([1234.5, -987.25, 40.0])
 
 
 def things_in(points: NDArray[np.float32], sensor: NDArray[np.float64], floors: list[Floor]) -> NDArray[np.int64]:
-    return things_of(points, standing(points, sensor, floors))
+    return label_objects(points, standing(points, sensor, floors))
 
 
 def ground(rng: np.random.Generator, slope: float = 0.0) -> NDArray[np.float32]:
@@ -80,8 +80,8 @@ def test_two_things_are_one_only_by_what_is_chosen() -> None:
     points = np.zeros((5, 3), np.float32)
     points[:, 0] = np.arange(5) * GAP + 0.5 * GAP
     points[4, 0] += 3 * GAP
-    assert things_of(points, np.ones(5, np.bool_)).tolist() == [1, 1, 1, 1, 2]
-    assert things_of(points, np.array([True, True, False, True, True])).tolist() == [1, 1, 0, 2, 3]
+    assert label_objects(points, np.ones(5, np.bool_)).tolist() == [1, 1, 1, 1, 2]
+    assert label_objects(points, np.array([True, True, False, True, True])).tolist() == [1, 1, 0, 2, 3]
 
 
 def test_nothing_in_reach_is_nothing() -> None:

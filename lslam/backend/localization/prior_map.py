@@ -211,8 +211,8 @@ class PlaceSearch:
     def is_near(self, position: Floats, radius: float) -> bool:
         """Whether the map was observed anywhere within `radius` m of a position (2,), level axes."""
         at = (np.arange(self.grid.size) - self.grid.size // 2 + 0.5) * CELL_M
-        away2 = (at[:, None] - position[0]) ** 2 + (at[None, :] - position[1]) ** 2
-        return bool(self.cells.visible.reshape(away2.shape)[away2 <= max(radius, CELL_M) ** 2].any())
+        distances2 = (at[:, None] - position[0]) ** 2 + (at[None, :] - position[1]) ** 2
+        return bool(self.cells.visible.reshape(distances2.shape)[distances2 <= max(radius, CELL_M) ** 2].any())
 
     def guesses(self, query: LevelSubmap, region: Region | None = None) -> list[Floats]:
         """T_level_query (4, 4), level axes of both, of the best correlations, best first; empty without upright structure.

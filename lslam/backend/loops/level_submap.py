@@ -173,8 +173,8 @@ class BevGrid:
     def within(self, centre: Floats, radius: float) -> Longs:
         """Flat cells of a correlation whose shifts lie within `radius` m, or a cell, of `centre` (2,), increasing."""
         along = self._along()
-        away2 = (along[:, None] - centre[0]) ** 2 + (along[None, :] - centre[1]) ** 2
-        return np.flatnonzero(away2 <= max(radius, self.cell) ** 2)
+        distances2 = (along[:, None] - centre[0]) ** 2 + (along[None, :] - centre[1]) ** 2
+        return np.flatnonzero(distances2 <= max(radius, self.cell) ** 2)
 
     def _along(self) -> Floats:
         """Shift (size,), m, of row or column k of a correlation."""

@@ -95,7 +95,7 @@ def start(
     shift = 0 if offset_s is None else round(1e9 * offset_s)
     cleaned = clean(replace(imu, stamps_ns=imu.stamps_ns + shift), int(first.stamps_ns[0]), last_ns)
     notes = list(cleaned.notes)
-    part = told_poses(first, cleaned.imu)[0]
+    part = covered_stretches(first, cleaned.imu)[0]
     agreement = check_agreement(
         cleaned.imu, T_lidar_imu, part.instants_ns, part.middles, None if offset_s is None else 0.0, least_offset_s
     )
@@ -106,7 +106,7 @@ def start(
     config = _without_wrong_bias(config, agreement.gyro_bias, problems)
     moved = round(1e9 * agreement.offset_s)
     usable = replace(cleaned.imu, stamps_ns=cleaned.imu.stamps_ns + moved)
-    part, opening = told_poses(first, usable)
+    part, opening = covered_stretches(first, usable)
     _refuse_sign(usable, T_lidar_imu, part, agreement.gyro_bias)
     guess, is_static = _first_guess(usable, T_lidar_imu, part.stamps_ns, part.poses, config, agreement.gyro_bias)
     options = config.estimate_extrinsics, config.estimate_offset
@@ -126,7 +126,7 @@ def start(
     return InertialStart(usable, T_lidar_imu, estimate, offset, agreement.is_judged, is_static, notes, problems)
 
 
-def told_poses(first: FirstPoses, imu: ImuStream) -> tuple[FirstPoses, FirstPoses]:
+def covered_stretches(first: FirstPoses, imu: ImuStream) -> tuple[FirstPoses, FirstPoses]:
     """The longest stretch of the first scans that the stream covers, and the covered stretch from the very first scan on.
 
     Raises ImuRefusedError when it covers no two successive scans.

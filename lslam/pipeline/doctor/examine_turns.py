@@ -17,7 +17,7 @@ from lslam.odometry.frontend.inertial_start import first_poses
 from lslam.odometry.inertial.agreement import FAR_S, LEAST_TURNING, NEAR_S, STEP_S, Agreement, check_agreement, turns
 from lslam.odometry.inertial.fusion import InertialMotion
 from lslam.odometry.inertial.imu_cleaning import CleanStream, ImuFault, ImuRefusedError, clean
-from lslam.odometry.inertial.initialise import FirstPoses, start, told_poses
+from lslam.odometry.inertial.initialise import FirstPoses, covered_stretches, start
 from lslam.pipeline.doctor import Facts, Finding, Findings
 
 log = logging.getLogger("lslam")
@@ -52,7 +52,7 @@ def examine_turns(sequence: Sequence, findings: Findings) -> Facts | None:
     seconds = float(np.clip(_SCANS / sequence.rate_hz, 0.5, 60))
     config = Config.model_validate({"imu": {"start_s": seconds}})
     try:
-        first, _ = told_poses(first_poses(sequence, config, None), stream.imu)
+        first, _ = covered_stretches(first_poses(sequence, config, None), stream.imu)
     except ImuRefusedError:
         return None  # gaps everywhere, which are found by now
     if len(first.instants_ns) < _FEWEST:
@@ -74,7 +74,7 @@ def _swept_by_imu(
         if not begun.offset_s:
             return first
         motion = InertialMotion(begun, config)
-        again = told_poses(first_poses(sequence, config, motion), imu)[0]
+        again = covered_stretches(first_poses(sequence, config, motion), imu)[0]
     except ImuRefusedError:
         return first
     return again if len(again.instants_ns) >= _FEWEST else first

@@ -13,7 +13,7 @@ from lslam.core.config.odometry import ImuConfig
 from lslam.core.geometry import se3
 from lslam.core.types.imu import ImuStream
 from lslam.odometry.inertial.imu_cleaning import ImuRefusedError, clean, gaps, gravity_unit
-from lslam.odometry.inertial.initialise import FirstPoses, InertialStart, start, told_poses
+from lslam.odometry.inertial.initialise import FirstPoses, InertialStart, covered_stretches, start
 from lslam.simulation.scenarios import SimulatedDrive
 
 
@@ -44,7 +44,7 @@ def test_first_poses_are_split_where_the_imu_has_a_gap() -> None:
     whole = ImuStream(times, np.ones((140, 3)), np.ones((140, 3)))
     heard = (times <= 320_000_000) | (times >= 580_000_000)
     parted = ImuStream(times[heard], whole.accel[heard], whole.gyro[heard])
-    longest, opening = told_poses(first, parted)
+    longest, opening = covered_stretches(first, parted)
     for found, scans, middles in ((longest, range(6, 12), range(6, 12)), (opening, range(4), range(3))):
         np.testing.assert_array_equal(found.stamps_ns, stamps[list(scans)])
         np.testing.assert_array_equal(found.poses[:, 3, 3], list(scans))
@@ -52,7 +52,7 @@ def test_first_poses_are_split_where_the_imu_has_a_gap() -> None:
         assert found.covariances is not None
         for values in (found.middles, found.covariances):
             np.testing.assert_array_equal(values[:, 0, 0], list(middles))
-    for found in told_poses(first, whole):
+    for found in covered_stretches(first, whole):
         np.testing.assert_array_equal(found.stamps_ns, stamps)
         np.testing.assert_array_equal(found.instants_ns, first.instants_ns)
 
