@@ -113,6 +113,8 @@ def against_odometry(
     """One sentence for each pair of successive points whose distance differs from odometry's by more than it may drift.
 
     Distances need no heading. A trajectory bends to a wrong point without a residual, so only odometry reveals the error.
+    drift : odometry's uncertainty; probability : of the chi-square quantile that a difference must exceed
+    geoid : grid by which heights of the points are made ellipsoidal, or empty
     """
     if len(points) < 2 or len(keyframes) < 2:
         return []

@@ -110,7 +110,11 @@ def describe_clock(offset: ClockOffset) -> str:
 def with_actual_sigmas(
     fixes: Fixes, level: Floats, largest: float, probability: float, faults: Faults
 ) -> tuple[Fixes, Faults]:
-    """The fixes with the sigmas of their scatter where they state less, up to the `largest`, m: beyond they are no fixes."""
+    """The fixes with the sigmas of their scatter where they state significantly less, and the faults with a sentence on it.
+
+    Sigmas are left as stated where the scatter would make them larger than `largest`, m: those are no fixes.
+    level : (3, 3) rotation that makes the trajectory level; probability : of the test for significance
+    """
     seconds = 1e-9 * (fixes.stamps_ns - fixes.stamps_ns[0])
     rough = rough_residuals(seconds, fixes.antenna @ level.T, fixes.positions)
     factors = np.ones_like(fixes.sigmas)
@@ -148,7 +152,10 @@ def _kinds(sigmas: Floats) -> list[Bools]:
 def align_fixes(
     fixes: Fixes, up: Floats, up_sigma: float, min_fixes: int, faults: Faults
 ) -> tuple[GnssAlignment | None, Fixes, Faults]:
-    """Alignment, None if too few fixes agree, the fixes, without heights of a deviating datum, and sentences on faults."""
+    """Alignment, None if too few fixes agree, the fixes, without heights of a deviating datum, and sentences on faults.
+
+    up, up_sigma : (3,) unit vector in the trajectory's world, rad; min_fixes : that must agree
+    """
 
     def fit(of: Fixes) -> GnssAlignment | None:
         return align(of.antenna, of.positions, of.sigmas, of.slack, up, up_sigma, min_fixes)

@@ -223,7 +223,7 @@ def read_manual(config: Config, sequence: Sequence) -> Manual:
 
 
 def require_instants(instants: Iterable[Instant], numbers: Longs, stamps_ns: Longs, slack: int = ROUNDING_NS) -> None:
-    """Raise InputError for an instant at which a run has no scan.
+    """Raise InputError for a scan number that a run has not, or a stamp outside of its time.
 
     numbers, stamps_ns : (N,) of its scans; slack : ns, that a stamp may lie before the first and behind the last
     """

@@ -313,7 +313,10 @@ def thickening(store: KeyframeStore, without: Floats, final: Floats) -> Thickeni
 
 
 def thicker_map(change: Thickening | None, held_by: str, probability: float) -> tuple[str, dict[str, Any]]:
-    """A sentence where planes are significantly thicker with `held_by` than without, else empty; and both thicknesses, m."""
+    """A sentence where planes are significantly thicker with `held_by` than without, else empty; and both thicknesses, m.
+
+    held_by : what constrains the graph, the subject of the sentence; probability : of the test for significance
+    """
     if change is None:
         return "", {}
     facts = {"planes_without_m": round(change.before, 4), "planes_m": round(change.after, 4)}

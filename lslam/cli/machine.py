@@ -64,7 +64,7 @@ def _cores() -> dict[str, Any]:
 
 
 def _memory() -> dict[str, Any]:
-    """Memory in bytes: of the machine, free, and the container's limit."""
+    """Memory in bytes: of the machine, free, and the container's limit, None without one."""
     page = os.sysconf("SC_PAGE_SIZE")
     free = os.sysconf("SC_AVPHYS_PAGES") * page
     for line in Path("/proc/meminfo").read_text().splitlines() if Path("/proc/meminfo").exists() else ():

@@ -149,7 +149,10 @@ def _matches(estimate: Floats, truth: Floats, stamps: Stamps, possible: int, rec
 
 
 def _no_overlap(estimate: Trajectory, stamps: Stamps, truth: Trajectory, count: int, max_diff: float) -> str:
-    """Message for only `count` matched poses: time ranges of both trajectories, and the option that can help."""
+    """Message for only `count` matched poses: time ranges of both trajectories, and the option that can help.
+
+    stamps : (N,) ns, of the estimate on the clock of the truth; max_diff : s, within which stamps match
+    """
     ranges = (
         f"estimate {estimate.source} covers {stamps[0] / 1e9:.3f} .. {stamps[-1] / 1e9:.3f} s, "
         f"ground truth {truth.source} {time_range(truth)}"
@@ -217,7 +220,10 @@ def _step(estimate: Trajectory, truth: Trajectory) -> int:
 
 
 def _rates(t: Trajectory, step: int, first: int | None = None, count: int | None = None) -> Floats:
-    """(M, 2) speed m/s and rotation rate rad/s, a sample every `step` ns, each over WINDOW_POSES samples against pose noise."""
+    """(M, 2) speed m/s and rotation rate rad/s, a sample every `step` ns, each over WINDOW_POSES samples against pose noise.
+
+    first : stamp of the first sample, ns; count : samples, of which WINDOW_POSES yield no rate; both of the whole by default
+    """
     first = int(t.stamps_ns[0]) if first is None else first
     if count is None:
         count = int((t.stamps_ns[-1] - t.stamps_ns[0]) // step) + 1

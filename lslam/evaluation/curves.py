@@ -69,7 +69,10 @@ def registration_ms(row: StudyRow) -> float:
 
 
 def _curve(rows: Sequence[StudyRow], limit: float) -> Curve:
-    """Curve of runs with one method over their first parameter: tables (V, S) of value and seed, NaN where no run is usable."""
+    """Curve of runs with one method over their first parameter: tables (V, S) of value and seed, NaN where no run is usable.
+
+    limit : error, m, above which a run is lost
+    """
     parameter, *_ = rows[0].parameters
     at = [(key, value) for key, value in rows[0].parameters.items() if key != parameter]
     given: list[Value] = [row.parameters[parameter] for row in rows]

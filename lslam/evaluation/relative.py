@@ -139,7 +139,10 @@ def error_transforms(estimate: Floats, truth: Floats, pairs: Longs) -> Floats:
 
 
 def _pairs(poses: Floats, seconds: Floats | None, delta: float, unit: str, all_pairs: bool) -> Longs:
-    """Pairs (K, 2) of pose indices that are `delta` scans, m or s apart."""
+    """Pairs (K, 2) of pose indices that are `delta` apart, in the `unit` "scan", "m" or "s".
+
+    all_pairs : one from every pose, overlapping; otherwise each begins where the last one ended. seconds : (N,), for "s" alone
+    """
     if unit == "scan":
         return by_index(len(poses), int(delta), all_pairs)
     if unit == "m":

@@ -147,7 +147,7 @@ class RemotePath(PosixPath):
         return stream if "b" in mode else io.TextIOWrapper(stream, encoding, errors, newline)
 
     def read_ranges(self, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
-        """Bytes [begin, end) of the object for each of `ranges`, requested together."""
+        """Bytes [begin, end) of the object for each of `ranges`, at least one, requested together."""
         with _asking(self, "read") as (system, place):
             if len(ranges) == 1:
                 return [bytes(system.cat_file(place, start=ranges[0][0], end=ranges[0][1]))]

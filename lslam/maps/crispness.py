@@ -48,7 +48,10 @@ def crispness(cloud: Cloud, radius: float = RADIUS, least: int = LEAST_POINTS, s
 
 
 def plane_variances(points: Floats, queries: Floats, radius: float = RADIUS, least: int = LEAST_POINTS) -> Floats:
-    """(Q,) m2, variance of the points (N, 3) about the plane through those around each query (Q, 3); NaN where these are few."""
+    """(Q,) m2, variance of the points (N, 3) about the plane through those around each query (Q, 3); NaN where these are few.
+
+    radius : m; least : points within it
+    """
     from lslam.maps.kernels.crispness import cell_keys, shapes
 
     if not len(points):
@@ -60,7 +63,10 @@ def plane_variances(points: Floats, queries: Floats, radius: float = RADIUS, lea
 
 
 def _slabs(cloud: Cloud, radius: float, step: int) -> Iterator[tuple[Floats, Floats]]:
-    """Every `step`-th point of the cloud, once, each group with all points of a slab in x that covers its neighbourhoods."""
+    """Pairs of points (N, 3), m, of a slab in x, and every `step`-th of them (M, 3), whose spheres of `radius`, m, it covers.
+
+    Each of these is in one pair only.
+    """
     if not isinstance(cloud, MergedMap):
         points = in_memory(cloud).points
         points = points[np.isfinite(points).all(1)]

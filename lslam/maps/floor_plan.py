@@ -142,7 +142,10 @@ def top_view(cloud: Cloud | NDArray[Any], pixel: float = 0.2, longest: int = 160
 
 
 def _bounds(cloud: Cloud, trim: float) -> tuple[Floats, Floats]:
-    """Quantiles of a regular sample of about 100,000 points, which is cheap, deterministic and robust to outliers."""
+    """Quantiles `trim` and 1 - `trim` of x and y (2,), m, of a regular sample of about 100,000 points.
+
+    It is cheap, deterministic and robust to outliers. NaN for a cloud without finite points.
+    """
     step, seen = max(1, len(cloud) // 100_000), 0
     parts = [np.zeros((0, 2))]
     for block in cloud.blocks():

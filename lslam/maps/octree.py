@@ -122,7 +122,10 @@ class _Builder:
         self._edge, self._total = edge, 0
 
     def divide(self, name: str, records: Records, low: Floats, edge: float) -> None:
-        """Write the node of a cube and those below it; a child's name ends with its number, 4 x + 2 y + z."""
+        """Write the node of a cube from corner `low` (3,) with side `edge`, m, and those below it.
+
+        A child's name ends with its number, 4 x + 2 y + z, of bits 0 or 1.
+        """
         self._total = self._total or len(records)
         if len(records) <= FEW or len(name) > DEEPEST:
             self._write(name, np.asarray(records), low, edge)

@@ -34,7 +34,10 @@ class Dlo(Icp):
     def register(
         self, scan: Scan, prepared: PreparedPoints, prior: MotionPrior, is_near: bool = False
     ) -> RegistrationResult:
-        """Register the scan, deskewed by the prior, on the last scan and then on the submap; the result is that on the submap."""
+        """Register the scan, deskewed by the prior, on the last scan and then on the submap; the result is that on the submap.
+
+        If the first fails, the second begins at the prior. `is_near` as for `Registration.locate`.
+        """
         clock = StageClock()
         with clock.stage("deskew"):
             points = self.with_surfaces(deskew(prepared, prior), prepared)

@@ -42,7 +42,10 @@ class GivenMotion(Stateful, MotionModel):
         return True
 
     def covers(self, stamp_ns: int) -> bool:
-        """Whether the trajectory has poses before and after the stamp, without a gap, or one within a millisecond."""
+        """Whether the trajectory has a pose at the stamp, or poses before and after it without a gap.
+
+        Its ends reach a millisecond farther, since the stamps of files are rounded.
+        """
         stamps = self.trajectory.stamps_ns
         right = int(np.searchsorted(stamps, stamp_ns))
         if right < len(stamps) and stamps[right] == stamp_ns:

@@ -75,8 +75,9 @@ class _PlacedView:
 def absent_buildings(
     buildings: Sequence[Building], sights: Sequence[KeyframeMatch], poses: Mapping[int, Floats]
 ) -> Bools:
-    """Whether each building (B,) is absent: no wall is seen near its outline, and walls behind are seen through it.
+    """Whether each building (B,) is absent: no wall is seen near its outline, and `VIEWS` keyframes see walls through it.
 
+    A canopy, which is open below, is never absent.
     buildings : displaced, m, map frame; poses : (3,) planar pose of each keyframe in the map frame
     """
     from shapely import STRtree, linestrings, points

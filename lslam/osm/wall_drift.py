@@ -90,7 +90,10 @@ class DriftFit:
         self._set_weights(np.ones(len(sightings.walls)))
 
     def negative_log_likelihood(self, noise: float, root: Floats, sizes: tuple[float, ...]) -> Floats:
-        """Twice the negative log-likelihood (len(sizes),), up to a constant, for `root` times each of `sizes`."""
+        """Twice the negative log-likelihood (len(sizes),), up to a constant, for `root` times each of `sizes`.
+
+        noise, root : as in `Sizes`
+        """
         from scipy.linalg import cho_factor, cho_solve
 
         variance, n = noise**2 * self._seen, len(self._given)

@@ -136,7 +136,7 @@ def _publish(stage: Path, folder: Path, names: set[str]) -> None:
 
 
 def _sorted_into(cloud: Cloud, size: float, spool: Path) -> Iterator[tuple[tuple[int, int], ArrayCloud]]:
-    """Key (X, Y) and points of each tile, in order of keys; the points are sorted through files in `spool`."""
+    """Key (X, Y) and points of each tile of `size` m, in order of keys; the points are sorted through files in `spool`."""
     record = np.dtype(
         [("points", np.float64, (3,)), ("intensity", np.float32), ("columns", list(cloud.column_types.items()))]
     )
@@ -182,7 +182,11 @@ def _part(spool: Path, key: tuple[int, int]) -> Path:
 
 
 def check_tiles(folder: Path, size: float, overwrite: bool) -> None:
-    """Raise UsageError, OutputExistsError or OutputError for an impossible output of tiles, before any work is done."""
+    """Make `folder`, before any work is done; tiles that are there are replaced later, if `overwrite` permits that.
+
+    Raises UsageError for tiles that are not of 1 to 10000 m (`size`), OutputExistsError for a folder with content, OutputError
+    for one of something else or that cannot be made.
+    """
     if not 1.0 <= size <= 10_000.0:
         raise UsageError(f"--tiles {size:g} is out of range: 1 to 10000 m")
     if folder.exists() and any(folder.iterdir()):

@@ -251,7 +251,7 @@ def _georeference(merge: Merge) -> Georeference | None:
 
 
 def _map(recordings: Sequence[Recording | None], merge: Merge, config: Config, watch: Watch, spool: Path) -> BuiltMap:
-    """Map of the scans of all sessions."""
+    """Map of the scans of all sessions but those without a recording (None)."""
     results = merge.results
     watch.on_start(
         "map", sum(len(r) for r, recording in zip(results, recordings, strict=True) if recording is not None)

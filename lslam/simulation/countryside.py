@@ -289,7 +289,10 @@ def build_carpark(
 
 
 def _add_bumps(site: StreetSite, low: Floats, high: Floats, roughness: float) -> None:
-    """Add ground from `low` to `high` (2,), m, with random bumps. Raises UsageError where it would be too large."""
+    """Add ground from `low` to `high` (2,), m, with random bumps, rms `roughness`, m.
+
+    Raises UsageError where it would be too large.
+    """
     x, y = (_grid_lines(float(low[k]), float(high[k])) for k in (0, 1))
     if len(x) * len(y) > MOST_BUMPS:
         raise UsageError(
@@ -335,7 +338,10 @@ def _add_cars(site: StreetSite, offset: float) -> None:
 
 
 def _add_house_row(site: StreetSite, side: int, half: float) -> Houses:
-    """Add houses that face the car park, `layout.setback` m from the path. Returns their outlines and heights."""
+    """Add houses that face the car park, `layout.setback` m from the path. Returns their outlines and heights.
+
+    side : 1 left of the street, -1 right; half : half the width of the car park, m
+    """
     layout, rng = site.layout, site.rng
     houses: Houses = []
     s = rng.uniform(0, layout.gap[1])

@@ -153,7 +153,7 @@ def parked_car(rng: np.random.Generator) -> SceneMesh:
 
 
 def _extrude(builder: MeshBuilder, outline: Floats, half_width: float, surface: int) -> None:
-    """A convex side view (K, 2) of x and z extruded along y, closed on all sides."""
+    """Add a convex side view (K, 2) of x and z, m, extruded along y to both sides by `half_width`, m, closed on all sides."""
     count = len(outline)
     sides = [np.column_stack([outline[:, 0], np.full(count, y), outline[:, 1]]) for y in (-half_width, half_width)]
     here, there = np.arange(count), (np.arange(count) + 1) % count
@@ -310,7 +310,10 @@ def _flat_roof(builder: MeshBuilder, width: float, depth: float, eaves: float) -
 
 
 def _porch(builder: MeshBuilder, rng: np.random.Generator, width: float) -> None:
-    """Add nothing, a porch with steps, or a bay as high as the ground floor, before a facade `width` m wide."""
+    """Add nothing, a porch with steps, or a bay as high as the ground floor, before a facade `width` m wide.
+
+    The facade stands along x, its middle at x = 0, its outside towards -y.
+    """
     kind, u = rng.random(), rng.uniform(-0.3, 0.3) * width
     if kind < 0.3:
         builder.add_box([u - 1.0, -1.2, 2.5], [u + 1.0, 0.05, 2.65], Surface.ROOF)

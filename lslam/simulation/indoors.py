@@ -19,7 +19,10 @@ LOW = 2.2  # m, of what stands in the aisle
 
 
 def build_hall(line: RouteCurve, terrain: Terrain, rng: np.random.Generator) -> City:
-    """Build a hall round a straight `line` along x, the middle of its floor."""
+    """Build a hall with racks, boxes, columns and beams round a straight `line` along x, the middle of its floor at z = 0.
+
+    `terrain` is only stored in the city. The hall is its one building.
+    """
     ends = line.position(np.array([0.0, line.length]))
     low, high = float(ends[0, 0]) - END, float(ends[1, 0]) + END
     middle = float(ends[0, 1])
@@ -57,7 +60,10 @@ def build_hall(line: RouteCurve, terrain: Terrain, rng: np.random.Generator) -> 
 def _add_racks(
     builder: MeshBuilder, low: float, high: float, middle: float, side: int, rng: np.random.Generator
 ) -> None:
-    """Add racks of different heights and depths between the aisle and one wall, with gaps."""
+    """Add racks of different heights and depths between the aisle and one wall, with gaps.
+
+    low, high : m, ends of the hall in x; middle : m, its axis in y; side : 1 for the wall at larger y, else -1
+    """
     x = low + rng.uniform(0.5, 3.0)
     while x < high - 3.0:
         length, depth = min(rng.uniform(2.0, 6.0), high - 0.5 - x), rng.uniform(0.8, 2.0)
@@ -231,7 +237,7 @@ def _add_shaft(builder: MeshBuilder) -> None:
 
 
 def _add_flights(builder: MeshBuilder, low: float) -> None:
-    """Add two flights of steps, each step a tread and a riser, and the landings."""
+    """Add two flights of steps, each step a tread and a riser, and the landings, from a floor at z = `low`, m."""
     half = low + STEPS * RISE
     for k in range(STEPS):
         for first, z, away, y in (

@@ -116,7 +116,10 @@ def _add_ground(
     band: float,
     rng: np.random.Generator,
 ) -> None:
-    """Add a grid of grass, lower where a road covers it, with larger cells under a whole district."""
+    """Add a grid of grass, lower where a road covers it, with larger cells under a whole district.
+
+    network : of the streets, None without; band : m, half the width that a street covers
+    """
     places = [footprint.outer for building in buildings for footprint in building.footprints]
     places += [street.position(street.sample(2.0)) for street in (network.streets if network else ())]
     everything = np.concatenate(places)
@@ -156,7 +159,10 @@ class _Gaps:
         self._walls = STRtree([Polygon(outer) for outer in outlines])
 
     def __call__(self, xy: Floats, offset: float, yaw: float) -> bool:
-        """Whether an object at `xy` (2,), `offset` m from the road's axis, has room; then it is recorded as occupied."""
+        """Whether an object at `xy` (2,), `offset` m from the road's axis, has room; then it is recorded as occupied.
+
+        yaw : rad, along which a car is long; what stands on the road is a car
+        """
         from shapely import points
 
         is_car = offset < self._road
@@ -320,7 +326,7 @@ def _level(builder: MeshBuilder, footprint: Footprint, z: float) -> None:
 
 
 def _canopy(builder: MeshBuilder, footprint: Footprint, bottom: float, top: float) -> None:
-    """Add a slab on posts, open on all sides."""
+    """Add a slab on posts, open on all sides; bottom, top : m, feet of the posts and upper side of the slab."""
     for z in (top - SLAB, top):
         _level(builder, footprint, z)
     for ring in footprint.rings:

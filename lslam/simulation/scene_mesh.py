@@ -150,7 +150,10 @@ def box(low: Any, high: Any) -> tuple[Floats, Longs]:
 
 
 def tube(radius_low: float, radius_high: float, bottom: float, top: float, sides: int) -> tuple[Floats, Longs]:
-    """Vertices and faces of an open vertical tube round the z axis, possibly conical."""
+    """Vertices (2 sides, 3), m, and faces (2 sides, 3) of an open vertical tube round the z axis, possibly conical.
+
+    radius_low, radius_high : m, at z = `bottom` and z = `top`, m; sides : quadrangles round it
+    """
     angle = 2 * np.pi * np.arange(sides) / sides
     ring = np.stack([portable.cos(angle), portable.sin(angle)], axis=1)
     low = np.column_stack([radius_low * ring, np.full(sides, bottom)])

@@ -87,7 +87,10 @@ class Places:
         self._taken = np.zeros((0, 2))
 
     def __call__(self, xy: Floats, offset: float, yaw: float) -> bool:
-        """Whether an object at `xy` (2,), `offset` m from the axis of its street, has room; then it is recorded as occupied."""
+        """Whether an object at `xy` (2,), `offset` m from the axis of its street, has room; then it is recorded as occupied.
+
+        yaw : rad, along which a car is long; what stands on the road is a car
+        """
         is_car = offset < self._road
         if self._network.distance(xy) < offset - (0.15 if is_car else 0.05):
             return False
@@ -113,7 +116,10 @@ def _shorten(street: RouteCurve, by: float) -> RouteCurve:
 def _side_streets(
     main: list[RouteCurve], streets: list[RouteCurve], layout: Layout, spacing: float, rng: np.random.Generator
 ) -> list[RouteCurve]:
-    """Streets off `main` on both sides. Each ends at one of `streets` or at an earlier side street, or at its own length."""
+    """Streets off `main` on both sides. Each ends at one of `streets` or at an earlier side street, or at its own length.
+
+    spacing : m, mean between two on one side
+    """
     from scipy.spatial import cKDTree
 
     street_tree = np.concatenate([street.position(street.sample(0.5)) for street in streets])
@@ -140,7 +146,10 @@ def _side_streets(
 def _street_until_crossing(
     start: Floats, ray: Floats, length: float, street_tree: Any, layout: Layout
 ) -> RouteCurve | None:
-    """Straight street from `start` along `ray` (2,) until it meets another; None when it would run too close to one."""
+    """Straight street from `start` along `ray` (2,) until it meets another; None when it would run too close to one.
+
+    length : m, where it meets none; street_tree : KD-tree of points on the other streets
+    """
     steps = np.arange(0.0, length, 0.5)
     points = start + steps[:, None] * ray
     away = np.asarray(street_tree.query(points)[0])

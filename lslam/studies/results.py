@@ -50,7 +50,10 @@ _MANY, _PARTS = 1000, 10
 
 
 def collect_run(job: Job, is_reused: bool = False) -> RunScore:
-    """Score of a job that has ended in any way; unreadable results give a failure with the reason."""
+    """Score of a job that has ended in any way; unreadable results give a failure with the reason.
+
+    is_reused : an earlier command made the run
+    """
     state = read_state(job.state_file)
     if state is None:
         return RunScore(job.sequence, job.method, job.seed, job.folder, "crashed", "the process left no state behind")
@@ -109,7 +112,10 @@ def _read_json(path: Path) -> dict[str, Any]:
 
 
 def _times(timing: Timing) -> dict[str, float]:
-    """Times per scan, ms, and the real-time factor: recorded time over processing time."""
+    """Times per scan, ms, by the names of results.csv; if a period is known, also the real-time factor and `over_limit`.
+
+    The factor is recorded time over processing time.
+    """
     values = {"time.total": 1e3 * timing.total.median, "time.p95": 1e3 * timing.total.p95}
     values |= {"time.mean": 1e3 * timing.total.mean, "time.max": 1e3 * timing.total.max}
     for name, stage in timing.stages.items():

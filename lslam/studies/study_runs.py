@@ -43,7 +43,10 @@ class RunLine:
 def opened_line(
     words: str, sequence: Recording, config: Config, truth: Trajectory | None, folder: Path | None, **reading: Any
 ) -> RunLine:
-    """Run of a recording that is open. Raises InputError when its files cannot be listed."""
+    """Run of a recording that is open, with its ground truth and the options `reading` that it was opened with.
+
+    Raises InputError when its files cannot be listed.
+    """
     digest = input_digest(sequence, truth) + _reading_digest(reading)
     imu = imu_digest(sequence) if config.imu.use else ""
     path = sequence.path.absolute()

@@ -117,7 +117,10 @@ def _against_odometry(graph: PoseGraph, ends: Ends, drift: Drift) -> tuple[Float
 
 
 def _voted_out(graph: PoseGraph, ends: Ends, drift: Drift, limit: float) -> list[tuple[int, float]]:
-    """Loop closures that most of their neighbours contradict, with the share that agrees."""
+    """Index of each loop closure that most of its neighbours contradict, with the share that agrees, the worst first.
+
+    limit : largest squared Mahalanobis distance of a cycle through two loop closures that agree
+    """
     from scipy.spatial import cKDTree
 
     where = np.column_stack([drift.distances[ends.a], drift.distances[ends.b]])

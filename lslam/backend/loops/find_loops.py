@@ -72,6 +72,7 @@ def verify_pairs(
 ) -> list[LoopCandidate]:
     """The known pairs as candidates, verified whatever odometry says; accepted ones are binding for the graph.
 
+    submap_size : keyframes whose clouds make a submap; up : (3,) unit vector in the world of odometry
     Raises InterruptedRunError when `should_stop` returns True between two.
     """
     detector = _detector(store, store.keyframes, config, registration, submap_size, up=up)
@@ -130,7 +131,11 @@ def view_pairs(record: RunRecord, store: KeyframeStore, size: int) -> list[PairV
 
 
 def view_pair(store: KeyframeStore, candidate: LoopCandidate, T_world_a: Floats, size: int, most: int) -> PairView:
-    """The view of a candidate; T_world_a : (4, 4) the older keyframe in a level world; most : points of each cloud."""
+    """The view of a candidate.
+
+    T_world_a : (4, 4) the older keyframe in a level world; size : keyframes whose clouds make a submap
+    most : points of each cloud that are kept
+    """
     odometry = np.stack([k.T_world_lidar for k in store.keyframes])
     a, b = (submap(store, odometry, k, size) for k in (candidate.a, candidate.b))
     a, b = (points[:: max(1, -(-len(points) // most))] for points in (a, b))

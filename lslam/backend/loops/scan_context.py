@@ -26,7 +26,7 @@ def describe(points: NDArray[np.float32], rings: int, sectors: int, reach: float
     """(rings, sectors) float32 heights over the ground, m, of points (N, 3) round the sensor, z up; 0 in empty cells.
 
     The ground is the lowest of the cells' heights, not the sensor's height, so that vehicles, drones and tilted sensors
-    all get the same image of a place.
+    all get the same image of a place. reach : horizontal radius of the image, m
     """
     image = polar_image(np.ascontiguousarray(points, np.float32), rings, sectors, reach)
     is_seen = np.isfinite(image)

@@ -126,8 +126,8 @@ def has_heights(crs: Any) -> bool:
 def exact_transformer(source: Any, target: Any, lat_lon: NDArray[Any], name: str) -> Any:
     """pyproj's most accurate transformer between two coordinate reference systems at positions (N, 2) lat, lon, deg.
 
-    Ballpark operations, which ignore the geoid, are never used, nor is a coarser one if the best lacks a grid: raises
-    UsageError with the grid's name.
+    It takes and gives easting or longitude first. Ballpark operations, which ignore the geoid, are never used, nor is a coarser
+    one if the best lacks a grid. Raises UsageError, which begins with `name`, for a lacking grid and where there is none.
     """
     from pyproj.aoi import AreaOfInterest
     from pyproj.transformer import TransformerGroup

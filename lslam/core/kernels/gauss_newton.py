@@ -155,7 +155,10 @@ def step(
 def step_on_surfaces(
     pose: Pose, sums: Sums, scale: float, limits: Limits, projector: Floats, d: Floats, weak: Floats
 ) -> tuple[bool, int, float, float]:
-    """Like `step`, with degenerate directions by S; a separate kernel, so that runs of other residuals need not compile it."""
+    """As `step`, which explains the arguments, with degenerate directions by S.
+
+    It is a separate kernel, so that runs of other residuals need not compile it.
+    """
     R, t = pose
     H, S, g, facts = sums
     make_whole(sums)

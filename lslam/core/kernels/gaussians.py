@@ -10,6 +10,12 @@ Layout, one row per slot of the pool:
     table (E,) int32 : open addressing, slot or -1
     state (4,) int64 : slots ever used, free-list length, clock hand, live voxels
     free (C,) int32 : slots given back
+
+Numbers of all voxels of a map:
+    size : edge, m; min_points : fewer points make no plane and no blob; blob : a voxel of points that are no plane
+    planarity : least (l1 - l0) / l2 of a plane, by the eigenvalues of the covariance of its points, the least first
+    floor : m2, added to every variance; common : m2, error that the points of a scan share, for the tilt of a normal
+    breadth : least variance across the beams in variances of the surface; 0 disables the test
 """
 
 from __future__ import annotations
@@ -106,7 +112,7 @@ def _refresh(
 
     The points of one ring of one scan lie on the cone of its beams, and those of the next scan lie on the same cone wherever
     the sensor has moved: they reflect the scan pattern, not a surface. A voxel of such points is `EMPTY`. A voxel is valid when
-    the variance of its points across the beams is at least `breadth` times that of the surface; `breadth` = 0 disables this.
+    the variance of its points across the beams is at least `breadth` times that of the surface.
     """
     s = moments[slot]
     n = s[0]
@@ -293,7 +299,7 @@ def _evict(
 
 @kernel
 def rehash(keys: Longs, table: Ints, size: int) -> None:
-    """Fill an empty table with the keys of a grown pool."""
+    """Fill an empty table with the keys of a grown pool; size : its slots ever used."""
     mask = len(table) - 1
     for slot in range(size):
         if keys[slot] != FREE:

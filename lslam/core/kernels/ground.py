@@ -80,9 +80,9 @@ def best_plane(
 def envelope(height: NDArray[np.float64], rise: float, tolerance: float) -> NDArray[np.float64]:
     """Highest possible ground in each cell of `height` (n, n): the lowest cone, rising `rise` m per cell, over any cell.
 
-    A cell supports a cone when at least a quarter of the cells within two of it, one or more, are as low: reflections from
-    under the road have few neighbours. The distance is that of steps to the eight neighbours: two sweeps, at most 8 %
-    longer than the straight line.
+    A cell supports a cone when at least a quarter of the cells within two of it, one or more, are as low, up to `tolerance`, m,
+    and the rise: reflections from under the road have few neighbours. The distance is that of steps to the eight neighbours:
+    two sweeps, at most 8 % longer than the straight line. `NO_HEIGHT` : no point, or no ground.
     """
     n = len(height)
     top = np.empty((n, n))
@@ -138,7 +138,10 @@ def above(
     top: NDArray[np.float64],
     tolerance: float,
 ) -> NDArray[np.int64]:
-    """Indices of the points more than `tolerance` over the ground `top` (2 half, 2 half), and of all outside of the grid."""
+    """Indices of the points more than `tolerance`, m, over the ground `top` (2 half, 2 half), and of all outside of the grid.
+
+    points : (N, 3) m; R : (3, 3) into the level axes of the grid; cell : edge, m; half : cells from the middle to a side
+    """
     kept = np.empty(len(points), np.int64)
     count = 0
     inverse = 1.0 / cell

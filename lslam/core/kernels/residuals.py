@@ -58,7 +58,10 @@ def add_facts(facts: Floats, information: float, square: float, robust: float, r
 def octant_slots(
     x: float, y: float, z: float, i: int, inverse: float, cells: Longs, slots: Ints, keys: Longs, table: Ints
 ) -> bool:
-    """Look up the slots (8,) of the voxels around point i at x, y, z, world; True when it has left its octant cell."""
+    """Look up the slots (8,) of the voxels around point i at x, y, z, m, world; True when it has left its octant cell.
+
+    inverse : voxels per m
+    """
     ix, iy, iz = (
         index_of(x - 0.5 / inverse, inverse),
         index_of(y - 0.5 / inverse, inverse),

@@ -60,7 +60,7 @@ def _passes(
     is_cylinder: bool,
     box: NDArray[np.float64],
 ) -> bool:
-    """Whether a point is finite, not zero, inside the range gate and outside the ego box."""
+    """Whether a point a, b, c, m, is finite, not zero, inside the range gate and outside the ego box; the rest as in `gate`."""
     x, y, z = float(a), float(b), float(c)
     d = x * x + y * y
     full = d + z * z
@@ -76,9 +76,10 @@ def _passes(
 def gate(
     points: NDArray[np.float32], range_min: float, range_max: float, is_cylinder: bool, box: NDArray[np.float64]
 ) -> NDArray[np.int64]:
-    """Indices of the points that are finite, not zero, inside the range gate and outside the ego box.
+    """Indices of the points (N, 3), m, that are finite, not zero, inside the range gate and outside the ego box.
 
-    is_cylinder : ranges are horizontal; `box` is x_min, x_max, y_min, y_max, z_min, z_max, or empty.
+    range_min, range_max : m, both still inside; is_cylinder : ranges are horizontal
+    box : x_min, x_max, y_min, y_max, z_min, z_max, m, or empty
     """
     kept = np.empty(len(points), np.int64)
     count = 0
@@ -98,7 +99,7 @@ def select_in_gate(
     is_cylinder: bool,
     box: NDArray[np.float64],
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """The points (K, 3) that `gate` keeps, and their times (K,); `times` is (N,) or empty."""
+    """The points (K, 3) that `gate` keeps with the same arguments, and their times (K,); `times` is (N,) or empty."""
     n = len(points)
     is_timed = len(times) == n
     kept, when = np.empty((n, 3), np.float32), np.empty(n if is_timed else 0, np.float32)
@@ -313,7 +314,7 @@ def find_neighboured_cells(
     """Indices of the points (N, 3) whose count times range reaches `least`, and whose voxel's count reaches `least_around`.
 
     counts : (N,) number of returns that each point averages; a voxel's count is the sum over its points that reach `least`
-    least, least_around : m, counts times the range of the point
+    least, least_around : m, counts times the range of the point; size : edge of the voxels, m
     """
     n = len(points)
     table = np.empty(table_size(n), np.int32)

@@ -99,7 +99,10 @@ def check_las(stream: BinaryIO) -> tuple[int, int]:
 
 
 def _laszip(stream: BinaryIO, begin: int, vlrs: int, record: int) -> tuple[lazrs.LazVlr, int]:
-    """Compression scheme of points, and layers of a chunk (0 without); raises ValueError if the file does not state it."""
+    """Compression scheme of points, and layers of a chunk (0 without); raises ValueError if the file does not state it.
+
+    begin : byte of the first of `vlrs` variable length records; record : bytes of a point, which the scheme must have
+    """
     import lazrs
 
     position = begin
@@ -123,7 +126,11 @@ def _laszip(stream: BinaryIO, begin: int, vlrs: int, record: int) -> tuple[lazrs
 
 
 def _check_chunks(stream: BinaryIO, laszip: lazrs.LazVlr, layers: int, count: int, offset: int, record: int) -> int:
-    """Largest number of points of a chunk. Raises ValueError if the chunk table contradicts the size of the file."""
+    """Largest number of points of a chunk. Raises ValueError if the chunk table contradicts the file.
+
+    layers : of a chunk, 0 without; count : points of the file; offset : byte at which they begin; record : bytes of a point
+    The position in the stream changes.
+    """
     import lazrs
 
     size = os.fstat(stream.fileno()).st_size
@@ -309,7 +316,7 @@ def _fields(columns: Columns, is_unix: bool) -> dict[str, NDArray[Any]]:
 
 
 def _header(laspy: Any, offset: Floats, wkt: str, types: Mapping[str, np.dtype[Any]], is_unix: bool) -> Any:
-    """laspy header for points of these column types; offset : (3,) m."""
+    """laspy header for points of these column types; offset : (3,) m; is_unix : whether their times are Unix time."""
     header = laspy.LasHeader(version="1.4", point_format=7 if set(_COLOURS) & set(types) else 6)
     own = _fields({name: np.zeros(0, kind) for name, kind in types.items()}, is_unix)
     known = set(header.point_format.dimension_names)

@@ -128,7 +128,10 @@ def _read_header(path: Path, data: bytes | mmap) -> tuple[str, list[_Element], i
 def _ascii_columns(
     path: Path, element: _Element, body: memoryview, start: int, is_last: bool
 ) -> dict[str, NDArray[Any]]:
-    """Columns by property of `element`, `start` lines behind the header; raises InputError for too few or bad lines."""
+    """Columns by property of `element`, `start` lines behind the header; raises InputError for too few or bad lines.
+
+    is_last : no element follows, so that more lines give the column of `beyond`
+    """
     every = [line for line in bytes(body).split(b"\n") if line.strip()][start:]
     lines = every[: element.count]
     if len(lines) < element.count:

@@ -102,7 +102,7 @@ def write_euroc(path: str | Path, trajectory: Trajectory) -> None:
 
 
 def write_csv(path: str | Path, trajectory: Trajectory, crs: str = "") -> None:
-    """Write a table for spreadsheets and GIS, atomically: stamp, UTC if the stamps are Unix time, position, m, quaternion.
+    """Write a table for spreadsheets and GIS, atomically: stamp, UTC if the stamps are Unix time, position, m, quaternion, body.
 
     crs : name of the coordinate reference system, a column of its own; empty: none
     """

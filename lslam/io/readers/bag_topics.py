@@ -241,7 +241,10 @@ def _lateness(stamps: Stamps) -> tuple[Stamps, Bools]:
 
 
 def _told_again(stamps: Stamps, late: Stamps, step: float) -> Bools:
-    """(N,) whether late messages repeat a span of time: a clock was set back, so they interleave with others and fill no gap."""
+    """(N,) whether late messages repeat a span of time: a clock was set back, so they interleave with others and fill no gap.
+
+    late : (N,) ns, delay of messages that came out of order, 0 for the others; step : usual time between two, ns
+    """
     again = np.zeros(len(stamps), bool)
     ahead = stamps[late == 0]
     for begin, end in runs(late > 0):

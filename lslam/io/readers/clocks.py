@@ -160,7 +160,7 @@ def ahead_of(
 
 
 def say_jitter(stamps: Stamps, what: str, voice: Voice) -> None:
-    """Add a note if the intervals of increasing stamps (N,) vary more than those of a sensor."""
+    """Add a note about `what`, its subject in the plural, if intervals of increasing stamps (N,) vary more than a sensor's."""
     steps = np.diff(stamps).astype(np.float64)
     if len(steps) < _SPREAD_SAMPLES or steps.min() <= 0:
         return
@@ -235,6 +235,7 @@ def _delay_range(w: Stamps, period: float) -> float:
 def _step_sizes(h: Stamps, w: Stamps, edges: Stamps, limit: float) -> Stamps:
     """Step of the clock `h` between messages k and k + 1 for every k of `edges`, ns; 0 where there is none.
 
+    h, w : (N,) ns, stamps of the header and of recording; limit : ns, smaller steps are none
     h - w is an offset minus the delay of recording, so its maxima count. A clock that goes back or is constant is
     wrong. Where it goes on, a delay could be the reason instead: it is a step only if no message on the same increasing
     stretch was recorded with so little delay.
@@ -269,7 +270,11 @@ def _intervals(across: NDArray[Any], steps: Stamps, period: float) -> Stamps:
 
 
 def _offsets(offset: Stamps, ahead: Stamps, limit: float) -> Stamps:
-    """Clock offset of each message, ns, relative to the clock, of those with many messages, that is nearest to recording."""
+    """Clock offset of each message, ns, relative to the clock, of those with many messages, that is nearest to recording.
+
+    offset : (N,) ns, sum of the steps up to each message; ahead : (N,) ns, of the headers relative to recording
+    limit : ns; a gap of half of it between sorted offsets parts two clocks
+    """
     order = np.argsort(offset, kind="stable")
     clocks = np.split(order, np.flatnonzero(np.diff(offset[order]) > 0.5 * limit) + 1)
     levels = offset[[int(clock[len(clock) // 2]) for clock in clocks]]

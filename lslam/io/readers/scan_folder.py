@@ -130,7 +130,10 @@ def _with_scans(stream: Stream | None, scans: StampedScans, what: str, folder: F
 
 
 def _stamps_file(folder: Folder) -> Path | None:
-    """File of stamps, named by `sequence.toml` or one of `STAMP_NAMES`; None without it."""
+    """File of stamps, named by `sequence.toml` or one of `STAMP_NAMES`; None without it.
+
+    That the file named by `sequence.toml` is missing becomes a problem.
+    """
     stated = folder.info.stamps
     for name in STAMP_NAMES if stated is None else (stated,):
         if (folder.path / name).is_file():

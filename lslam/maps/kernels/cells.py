@@ -217,7 +217,10 @@ def add_rows(
 
 @kernel
 def unpack(rows: NDArray[np.int64], origin: NDArray[np.int64], voxel: float) -> NDArray[np.float64]:
-    """(M, 3) float64 mean positions, m, of finished rows (M, 5 or more)."""
+    """(M, 3) float64 mean positions, m, of finished rows (M, 5 or more).
+
+    origin : (3,) cell in the middle of the key range; voxel : edge of a cell, m
+    """
     points = np.empty((len(rows), 3))
     for i in range(len(rows)):
         key, count = rows[i, 0], rows[i, 4] * UNITS
@@ -264,7 +267,9 @@ def mark_ends(
 
     points : (N, 3) sensor frame, m; T : (4, 4) world from sensor; origin : (3,) cell in the middle of the key range
     stamp : number of the scan; model : log-odds of a hit and of a miss, and their lower and upper bound
-    Beams longer than `range_max`, m, end there without a hit. Only one beam per end cell is returned.
+    voxel : edge of a cell, m
+    Beams longer than `range_max`, m, end there without a hit, those shorter than `range_min` are left out. Only one beam per
+    end cell is returned.
     """
     ends = np.empty((len(points), 3))
     count = 0
@@ -316,6 +321,7 @@ def carve(
     """Update the cells that the beams cross before their ends with a miss, once each (Amanatides and Woo 1987).
 
     start : (3,) common start of the beams, in cells; ends : (E, 3), in cells; longest : most cells that a beam crosses
+    begin : first beam to cast; row_count : rows used before; the rest as in `mark_ends`
     Returns the rows used now, and the index of the first beam that was not cast because `rows` was full, else len(ends).
     """
     cell = np.empty(3, np.int64)

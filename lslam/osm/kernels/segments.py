@@ -25,6 +25,7 @@ def upright_plane(
 ) -> tuple[float, float]:
     """Horizontal unit normal of the points in the eight cells about a corner of the lattice; 0, 0 where they are no wall.
 
+    tilt : largest vertical part of a wall's unit normal; thickness : largest standard deviation across it, m
     total : (10,) workspace for the sum of the moments
     """
     for i in range(10):
@@ -141,7 +142,10 @@ def flat_walls(
 
 @inline
 def best_line(flat: Floats, tries: Longs, first: int, tolerance: float, agreement: float) -> int:
-    """Row whose line, through its position and across its normal, has most points, among the rows that are tried."""
+    """Row whose line, through its position and across its normal, has most points, among the rows `tries[first]`.
+
+    A point lies on a line within `tolerance`, m, and if the cosine between the normals is at least `agreement`.
+    """
     best, best_score = -1, -1.0
     for t in range(tries.shape[1]):
         k = tries[first, t] % len(flat)
@@ -213,7 +217,10 @@ def reach_out(
 
 @inline
 def refit(flat: Floats, line: Floats, low: float, high: float, tolerance: float, agreement: float) -> float:
-    """Replace `line` (4,) by the total least squares line of its points between `low` and `high`, m; returns their rms, m."""
+    """Replace `line` (4,) by the total least squares line of its points between `low` and `high`, m; returns their rms, m.
+
+    line : x, y, m, of a point on it, and its unit normal; tolerance, agreement : as in `best_line`
+    """
     n = sx = sy = xx = xy = yy = 0.0
     for j in range(len(flat)):
         f = flat[j]
@@ -261,6 +268,8 @@ def find_segments(
     Del Tufo, algorithm 3.1: RANSAC finds the best of a few lines, and the segment spans the largest cluster of its inliers,
     which is then removed. This repeats until fewer than `min_cluster` points or no row of random numbers `tries` (R, K) is
     left. A hypothesis is one point with its own normal, not two points.
+    every : (L, 3) x, y, m, and number of all points; tolerance, agreement : as in `best_line`; gap : largest in a segment, m
+    min_length : of a segment, m; step : largest gap to a point of `every` that extends it, m
     """
     flat = flat.copy()
     found = np.empty((len(tries), 6))

@@ -198,6 +198,7 @@ def fit(
     """Mean distance, m, of the source (S, 4) at `pose` from the target, the covered share of its length, and the pairs (S,).
 
     The mean is weighted by length. A wall without a partner has the distance `farthest`, m, and pair -1.
+    pose : (3,) m and rad; likeness, by_coverage : as in `line_distance`
     """
     distance = covered = total = 0.0
     pair = np.full(len(source), -1, np.int64)
@@ -235,6 +236,7 @@ def refine(
     length / (length + short) and by the Geman-McClure weight. `trust` (3,), the inverse variances of `prior` relative to that
     of a wall, decides along free directions. Returns the pose (3,), the normal matrix (3, 3) of the walls alone about their
     centre, the centre (2,), m, the weighted rms of the distances, m, and the pairs (S,) of the last iteration.
+    likeness, by_coverage : as in `line_distance`
     """
     pose = pose.copy()
     normal = np.zeros((3, 3))

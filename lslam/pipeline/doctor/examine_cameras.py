@@ -193,7 +193,10 @@ def _in_world(scan: Scan, points: NDArray[np.intp], motion: ContinuousMotion) ->
 def _scores(
     camera: Camera, stamp_ns: int, image: Image, edges: Floats, weights: Floats, motion: ContinuousMotion, reach: int
 ) -> Floats:
-    """Mean strength of the image's edges at the edges of depth (T, 2R+1, 2R+1), by time, rows and columns of the shift."""
+    """Mean strength of the image's edges at the edges of depth (T, 2R+1, 2R+1), by time, rows and columns of the shift.
+
+    edges, weights : (N, 3), m, world, and (N,) of the edges of depth; reach : R, the largest shift, pixels
+    """
     from scipy.ndimage import gaussian_gradient_magnitude
 
     from lslam.maps.kernels.views import project_all, shifted_means
@@ -217,7 +220,10 @@ def _times() -> Floats:
 
 
 def _peak(scores: Floats, reach: int) -> Floats:
-    """Time, s, and shift right and down, pixels, (3,) of the highest score, between the steps by a parabola on each axis."""
+    """Time, s, and shift right and down, pixels, (3,) of the highest score, between the steps by a parabola on each axis.
+
+    scores, reach : as in `_scores`
+    """
     i, row, column = (int(n) for n in np.unravel_index(int(np.argmax(scores)), scores.shape))
     fine = []
     for k, line in ((i, scores[:, row, column]), (row, scores[i, :, column]), (column, scores[i, row])):

@@ -88,7 +88,10 @@ def _longest_still(accel: Floats, gyro: Floats, rate: float) -> slice:
 
 
 def allan_deviation(values: Floats, rate: float) -> tuple[Floats, Floats]:
-    """Averaging times (K,), s, and the overlapping Allan deviation (K, 3) of values (N, 3) (IEEE Std 952, annex C)."""
+    """Averaging times (K,), s, and the overlapping Allan deviation (K, 3) of values (N, 3) (IEEE Std 952, annex C).
+
+    rate : of the values, Hz; the deviation has their unit
+    """
     n = len(values)
     sizes = np.unique(np.geomspace(1, max(n // _FITS, 1), 40).astype(int))
     theta = np.concatenate([np.zeros((1, 3)), np.cumsum(values, axis=0)]) / rate
@@ -100,7 +103,10 @@ def allan_deviation(values: Floats, rate: float) -> tuple[Floats, Floats]:
 
 
 def _by_allan(values: Floats, rate: float) -> Noise:
-    """Noise density, bias instability and random walk by the Allan deviation of values (N, 3); the latter for long data only."""
+    """Noise density, bias instability and random walk by the Allan deviation of values (N, 3) at `rate` Hz.
+
+    Data of less than `_STABLE_S` s give the density alone.
+    """
     times, each = allan_deviation(values, rate)
     deviation = np.sqrt(np.mean(each**2, axis=1))
     # White noise rules the shorter half of the times, all below a second, over which it falls with their root.

@@ -151,7 +151,10 @@ def examine_units(
     with_gnss: bool = True,
     sweep: Span | None = None,
 ) -> None:
-    """Add findings about stamps of the scans, IMU, fixes and `truth`, and about per-point times, which span `sweep`."""
+    """Add findings about stamps of the scans, IMU, fixes and `truth`, and about per-point times, which span `sweep`.
+
+    with_imu, with_gnss : whether these streams are examined
+    """
     stamps = sequence.stamps_ns
     if len(stamps) < 2:
         return

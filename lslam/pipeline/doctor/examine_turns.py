@@ -118,7 +118,10 @@ def compare(stream: CleanStream, T_lidar_imu: Floats, stamps_ns: Longs, poses: F
 
 
 def _with_axes(stream: CleanStream, R: Floats, stamps_ns: Longs, poses: Floats) -> Agreement:
-    """Agreement after a correction of axes by R (3, 3), perhaps a reflection; before, the clock offset is unobservable."""
+    """Agreement after a correction of axes by R (3, 3), perhaps a reflection; before, the clock offset is unobservable.
+
+    It is not judged where the stream is refused.
+    """
     T = np.eye(4)
     T[:3, :3] = R
     try:
