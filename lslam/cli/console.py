@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 class RemainingTime:
-    """Estimate of the remaining time; `at_once` steps are made together, and one begins when another ends.
+    """Estimate of the remaining time of `total` steps; `at_once` are made together, and one begins when another ends.
 
     A running step counts with the usual duration less its elapsed time. Steps are taken to end in the order they began, since
     a swap leaves the sum of their times unchanged. The first ones wait for kernels that are compiled: once there are others, they

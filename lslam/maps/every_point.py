@@ -25,6 +25,7 @@ class EveryPointMap:
     """All points in the world frame, in the order of the recording; satisfies `Cloud`.
 
     They lie in a file, which goes when the map does, unless its folder is kept.
+    record : of a point in the file; count : points; types : of the further columns; owner : of the folder
     """
 
     def __init__(

@@ -77,7 +77,7 @@ class OccupancyMapper:
 
     voxel : edge of a cell, m; range_min, range_max : m; farther points only free the cells up to there
     spool : folder beside which large maps are kept meanwhile; None: the system's temporary one; keep : one that stays
-        instead, for `restore`
+        instead, for `restore`; most : cells in memory
     origin : (3,) int64, cell in the middle of the key range; None: where the first scan is
     Raises ConfigError: a cell or range that makes no sense. OutputError: the spool cannot be written.
 

@@ -111,7 +111,10 @@ def _take_records(path: Path, kind: np.dtype[Any], most_points: int) -> Records:
 
 
 class _Builder:
-    """Divides nodes and writes them, parents first; `nodes` has of each, by its name, the first byte and the number of points."""
+    """Divides nodes and writes them, parents first; `nodes` has of each, by its name, the first byte and the number of points.
+
+    edge : of the root, m; most_points : in memory at a time, more lie in files in `spool`
+    """
 
     def __init__(
         self, stream: BinaryIO, spool: Path, edge: float, most_points: int, on_share: Callable[[float], None]

@@ -105,7 +105,7 @@ class SortedRuns:
 
 
 class StoredRows:
-    """Rows in a file, with their keys in a second one for searching."""
+    """Rows in a file, with their keys in a second one for searching; owner : of the folder, which stays as long as it is held."""
 
     def __init__(self, path: Path, columns: int, owner: object) -> None:
         self.columns = columns

@@ -146,7 +146,10 @@ class ElasticResult:
 
 
 class SweepPoints:
-    """Source points sorted by time, in `SWEEP_PARTS` parts that share the map's levels but have correspondences of their own."""
+    """Source points sorted by time, in `SWEEP_PARTS` parts that share the map's levels but have correspondences of their own.
+
+    sigma : standard deviation of a point, m
+    """
 
     def __init__(self, points: PreparedPoints, levels: Sequence[GaussianMap], sigma: float) -> None:
         assert points.source_times is not None

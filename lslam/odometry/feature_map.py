@@ -130,6 +130,7 @@ class FeatureMap(Stateful):
 
     size : m, edge of a voxel of edges; plane_size : m, edge of the smallest voxel of planar points
     reach : m, voxels farther than this from the sensor are given back
+    capacity : voxels at first, a quarter of them of edges; it grows
     """
 
     STATE = ("planes", "edges")

@@ -180,7 +180,10 @@ class FeatureCloud:
 
 
 class FeatureMaker:
-    """Averages less sharp edges and less planar points in voxels; keep : folder for a map that can be resumed."""
+    """Averages less sharp edges and less planar points in voxels.
+
+    voxel : edge, m; reach : greatest range of points, m; keep : folder for a map that can be resumed
+    """
 
     def __init__(self, voxel: float, reach: float, keep: Path | None = None) -> None:
         self._parts = {

@@ -286,7 +286,10 @@ M = TypeVar("M", bound=Maker)
 
 
 class MapCheckpoints:
-    """Checkpoints of a pass over scans, for a later pass over the same poses after an interruption."""
+    """Checkpoints of a pass over scans, for a later pass over the same poses after an interruption.
+
+    what : name of the result, for the log
+    """
 
     def __init__(self, checkpoints: Checkpoints, what: str) -> None:
         self._checkpoints, self._what = checkpoints, what

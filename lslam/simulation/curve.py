@@ -137,7 +137,10 @@ def _resample(points: Floats) -> tuple[Floats, float]:
 
 
 def rounded_rectangle(width: float, depth: float, radius: float) -> Floats:
-    """(N, 2) points of a rounded rectangle, counter-clockwise, from the middle of the lower side along +x, m."""
+    """(N, 2) points, m, of a rounded rectangle about the origin, counter-clockwise, from the middle of the lower side along +x.
+
+    width : m, in x; depth : m, in y; radius : m, of the corners
+    """
     corners = []
     for k, (sx, sy) in enumerate(((1, -1), (1, 1), (-1, 1), (-1, -1))):
         angle = np.linspace(-np.pi / 2, 0, 48) + k * np.pi / 2

@@ -58,6 +58,8 @@ class SimulatedDrive(Scans):
     the frame of `city`. Scans are traced on demand, each with its own seed: any order gives the same bytes.
 
     further : the scans of other LiDARs on the same vehicle, in the order of the scenario, with truth and extrinsics of their own
+    motion_compensated : whether all points of a scan are seen from one pose; scene : of `city`, None to make it
+    origin : (3,) lat, lon (deg), height (m) of the city's origin; visit : of several to one city, with noise of its own
     """
 
     kind = "simulated"

@@ -209,7 +209,10 @@ def cells_of(
 
 
 def _recording_cell(word: str, own: ScanRange, needs_imu: bool, output: OutputOptions, may_fail: bool) -> Cell:
-    """Cell of the recording `word`. Raises InputError when it cannot be opened; if `may_fail`, the cell holds it as `refusal`."""
+    """Cell of the recording `word`, with the digest of its IMU if `needs_imu`; one in storage is listed, but not opened.
+
+    Raises InputError when it cannot be opened; if `may_fail`, the cell holds it as `refusal`.
+    """
     path = as_path(word).expanduser().absolute()
     try:
         path = find_folder(word, output.data_root).absolute()

@@ -190,7 +190,10 @@ def _more(key: str, unit: str, group: Group) -> Metric:
 
 
 class Results:
-    """Rows of finished runs in the study's order, in whole files, some seconds late for thousands, until `flush`."""
+    """Rows of finished runs in the study's order, in whole files, some seconds late for thousands, until `flush`.
+
+    out : folder of the files; variants : of all jobs, by name; metric : key of the error of a row
+    """
 
     def __init__(
         self, study: str, out: Path, jobs: Sequence[Job], variants: dict[str, Variant], metric: str = "ate_se3"

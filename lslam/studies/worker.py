@@ -40,7 +40,7 @@ INTERRUPTED = ("interrupted", "interrupted before its end")
 
 
 class ScanStore:
-    """Scans by key, those used least lately forgotten first; any thread may ask."""
+    """Scans by key, up to `most_bytes` of them, those used least lately forgotten first; any thread may ask."""
 
     def __init__(self, most_bytes: int) -> None:
         self.most_bytes, self.bytes = most_bytes, 0

@@ -43,7 +43,7 @@ class KeyframeStore(Stateful):
     for the clouds. A folder that has an index is opened with what it holds. Several threads may ask for points.
 
     folder : created when the first cloud is added; None keeps the packed clouds in memory
-    deflate : how much clouds are packed, from 0, not at all, to 9
+    cache_size : clouds in memory; deflate : how much clouds are packed, from 0, not at all, to 9
 
     Raises InputError for an index or a cloud that is damaged or missing, OutputError for what cannot be written.
 

@@ -271,7 +271,7 @@ class PlaceSearch:
 class TurnedViews:
     """The window about a submap, seen from above at numbered headings, `QUARTER` of them in a quarter of the circle.
 
-    first : rad, yaw of heading 0
+    query : the submap, of which points within WINDOW_M are used; first : rad, yaw of heading 0
     step : rad, from one heading to the next
     """
 

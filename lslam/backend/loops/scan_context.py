@@ -65,7 +65,7 @@ def create(config: LoopsConfig) -> PlaceIndex:
 
 
 class PlaceIndex:
-    """The places seen so far, by keyframe number."""
+    """The places seen so far, by keyframe number; rings, sectors, reach : as for `describe`."""
 
     def __init__(self, rings: int = RINGS, sectors: int = SECTORS, reach: float = REACH_M) -> None:
         self.rings, self.sectors, self.reach = rings, sectors, reach

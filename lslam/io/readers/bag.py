@@ -149,6 +149,7 @@ def _others(path: Path) -> str:
 def open_folder(path: Path, overrides: SequenceInfo, why: str) -> Sequence:
     """Open the bag file, or the folder of them, at `path`; several requested LiDARs are merged into one sequence.
 
+    overrides : outrank `sequence.toml`; why : reason for this format, for the notes
     Raises InputError when it is unreadable, has no clouds, or lacks the extrinsics of a LiDAR to be merged, UsageError for
     topics that are ambiguous or do not exist.
     """

@@ -40,7 +40,10 @@ def locate(folder: Path) -> tuple[Path, str] | None:
 
 
 def open_folder(path: Path, overrides: SequenceInfo, why: str) -> FolderSequence:
-    """Open the sequence in `path`. Raises InputError when it has no scans or a broken `sequence.toml`."""
+    """Open the sequence in `path`; overrides : outrank `sequence.toml`; why : reason for this format, for the notes.
+
+    Raises InputError when it has no scans or a broken `sequence.toml`.
+    """
     nothing = f"{path / 'velodyne'} holds no scans (*.bin): fetch the velodyne data of this sequence"
     folder = Folder.begin(path, KIND, why, overrides, list_scans(path / "velodyne"), nothing)
     info, voice, record = folder.info, folder.voice, folder.record

@@ -90,7 +90,10 @@ def locate(folder: Path) -> tuple[Path, str] | None:
 
 
 def open_folder(path: Path, overrides: SequenceInfo, why: str) -> FolderSequence:
-    """Open the drive in `path`. Raises InputError when it has no scans or a broken `sequence.toml`."""
+    """Open the drive in `path`; overrides : outrank `sequence.toml`; why : reason for this format, for the notes.
+
+    Raises InputError when it has no scans or a broken `sequence.toml`.
+    """
     data = path / "velodyne_points" / "data"
     # Unsynchronised (`extract`) drives come as text.
     scans = list_scans(data, (*SUFFIXES, ".txt")) if data.is_dir() else ([], [])

@@ -57,7 +57,10 @@ def locate(path: Path) -> tuple[Path, str] | None:
 
 
 def open_folder(path: Path, overrides: SequenceInfo, why: str) -> PcapSequence:
-    """Open the capture at `path`. Raises InputError if unreadable, without packets of a known sensor or their metadata."""
+    """Open the capture at `path`; overrides : outrank `sequence.toml`; why : reason for this format, for the notes.
+
+    Raises InputError if unreadable, without packets of a known sensor or their metadata.
+    """
     info, _ = read_info(path.parent, overrides)
     voice = Voice([f"format {KIND}: {why}", *compensation_note(info)], [])
     datagrams = read_datagrams(path)

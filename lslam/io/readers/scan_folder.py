@@ -37,7 +37,10 @@ def locate(folder: Path) -> tuple[Path, str] | None:
 
 
 def open_folder(path: Path, overrides: SequenceInfo, why: str) -> FolderSequence:
-    """Open the scans of `path`. Raises InputError when there are none or `sequence.toml` is broken."""
+    """Open the scans of `path`; overrides : outrank `sequence.toml`; why : reason for this format, for the notes.
+
+    Raises InputError when there are none or `sequence.toml` is broken.
+    """
     nothing = f"{path} holds no scans ({', '.join('*' + s for s in SUFFIXES)})"
     folder = Folder.begin(path, KIND, why, overrides, _scans_in(path), nothing)
     info, voice = folder.info, folder.voice

@@ -32,6 +32,7 @@ _DIAGONAL, _NO_COVARIANCE = 2, 0  # sensor_msgs/NavSatFix
 class BagWriter:
     """Writes a bag, whole or not at all: a ROS 1 `.bag`, or a ROS 2 folder, or a single file when `path` ends in .mcap or .db3.
 
+    kind : bag, mcap or sqlite; is_zstd : compress, mcap and sqlite only
     Raises OutputError when it cannot be written, UsageError for a compression the kind does not have.
     """
 
