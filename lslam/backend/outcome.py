@@ -136,7 +136,10 @@ def solve(graph: PoseGraph, inputs: BackEndInput, georeference: Georeference | N
 
 
 def without_steady_drift(graph: PoseGraph, inputs: BackEndInput) -> PoseGraph:
-    """The graph corrected by the steady drift that its loop closures reveal; unchanged where they reveal none."""
+    """The graph corrected by the steady drift that its loop closures reveal, if `graph.steady_drift` is set.
+
+    It is unchanged where they reveal none and where it cannot be solved; drift that cannot be estimated becomes a problem.
+    """
     if not inputs.config.graph.steady_drift:
         return graph
     try:

@@ -70,7 +70,10 @@ def parse_classes(value: Any) -> tuple[str, ...]:
 
 
 def numbers_of(names: Iterable[str]) -> set[int]:
-    """Numbers of the classes `names`. Raises ValueError for an unknown one."""
+    """Numbers of the classes `names`, which may be numbers themselves; `moving` is all that move.
+
+    Raises ValueError for an unknown one.
+    """
     numbers: set[int] = set()
     for name in names:
         if name.isdecimal() and int(name) < _VALUES:

@@ -206,7 +206,7 @@ def elbow(values: Floats, errors: Floats, lost_mask: Bools) -> float | None:
 
     The plateau is the median error of the upper half of the values; errors up to 1.5 times that belong to it.
 
-    errors : (V,) nan where unknown
+    errors : (V,) nan where unknown; lost_mask : (V,) whether runs at a value are lost, which is off the plateau
     """
     known = np.isfinite(errors) | lost_mask
     values, errors, lost_mask = values[known], errors[known], lost_mask[known]
@@ -334,7 +334,7 @@ def law_over(kind: LawKind, curve: Curve, times: Interval) -> Law | None:
 
 
 def rival(law: Law) -> tuple[str, float]:
-    """Alternative law that the times may follow, as text, and its R2.
+    """Alternative law that the times may follow, as text, and its R2; empty and -inf where there is none.
 
     Over a narrow range a line and a hyperbola are alike, and a product is not tested by a parameter that hardly varied.
     """

@@ -209,7 +209,7 @@ def _rotation_note(estimate: Floats, truth: Floats) -> list[str]:
 
 
 def _nearly_straight(truth: Floats, config: EvalConfig) -> list[str]:
-    """Note when positions hardly constrain the rotation about the path, so that aligned rotation errors are unreliable."""
+    """Note, in a list, where positions hardly constrain rotation about the path: aligned rotation errors are then unreliable"""
     centred = truth[:, :3, 3] - truth[:, :3, 3].mean(axis=0)
     spread = np.linalg.svd(centred, compute_uv=False) / np.sqrt(len(truth))
     if not {"se3", "sim3"} & set(config.align) or not 1e-4 * spread[0] < spread[1] <= STRAIGHT_SHARE * spread[0]:
@@ -256,7 +256,7 @@ def _offset(estimate: Trajectory, truth: Trajectory, config: EvalConfig) -> tupl
 
 
 def _better_offset(estimate: Trajectory, truth: Trajectory, matches: Matches, config: EvalConfig) -> list[str]:
-    """Note when the estimate clearly fits the truth better at another instant of the sweep than the stamps state."""
+    """Note, in a list, when the estimate clearly fits the truth better at another instant of the sweep than the stamps state."""
     fit = fit_offset(estimate, truth) if config.time_offset == 0 else None
     if fit is None or not fit.is_clearly_off():
         return []

@@ -288,6 +288,7 @@ def median_and_worst(values: Sequence[float]) -> tuple[float, float]:
 def difficulty(pairs: Sequence[tuple[float | None, Sequence[float]]]) -> str:
     """How hard ours was beside theirs: `as hard`, `easier`, `harder` or `partly as hard`; empty where nobody knows.
 
+    A measure is as hard if the median of ours is that printed, up to the factor `LIKE` either way.
     pairs : of each measure of it, the printed number and those of our runs; all must say the same
 
     >>> difficulty([(2.0, [0.1, 0.2])]), difficulty([(2.0, [1.5]), (9.0, [8.0])]), difficulty([(None, [1.0])])

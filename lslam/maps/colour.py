@@ -212,8 +212,9 @@ def image_gains(views: NDArray[np.int32], colours: NDArray[np.uint8], is_view: B
 
     views, is_view : (N, K) the images that show each point, and where there is one; colours : (N, K, 3)
 
-    Least squares of the logarithms, every point's colour eliminated, with Cauchy weights by the median deviation, since some
-    views show what passed before the point. One observation of gain 1 for every image fixes what the points leave open.
+    Least squares of the logarithms of colours from 1 to 254, every point's colour eliminated, with Cauchy weights by the median
+    deviation, since some views show what passed before the point. One observation of gain 1 for every image fixes what the
+    points leave open.
     """
     unsaturated = is_view & ((colours > 0) & (colours < 255)).all(2)
     several = unsaturated.sum(1) > 1

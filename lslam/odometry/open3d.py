@@ -53,7 +53,7 @@ class Open3dGicp(Traits):
         self._last: Reference | None = None
 
     def prepare(self, scan: Scan) -> Any:
-        """Open3D's point cloud: gated, down-sampled, with a covariance per point."""
+        """Open3D's point cloud: gated, down-sampled, with a covariance per point unless there are too few to register."""
         points = clean_points(scan.points, self._preprocess).astype(np.float64)
         package = self._package
         cloud = package.geometry.PointCloud(package.utility.Vector3dVector(points)).voxel_down_sample(LEAF_M)

@@ -160,7 +160,7 @@ def _vicinity(before: Session, session: Session) -> Vicinity:
 
 
 def _chain(frame: Sequence[_Part], store: KeyframeStore, config: Config) -> dict[int, list[ScanResult]]:
-    """Scans of the segments of a frame as one drive; only their keyframes stay in the store."""
+    """Scans of the segments of a frame as one drive, by segment; only their keyframes stay in the store."""
     sessions = [part.session for part in frame if part.session is not None]
     if not sessions:
         return {}

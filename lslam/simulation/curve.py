@@ -150,7 +150,10 @@ def rounded_rectangle(width: float, depth: float, radius: float) -> Floats:
 
 
 def winding_line(rng: np.random.Generator, length: float, bend: float = 0.22) -> Floats:
-    """(N, 2) points, m, of a street of `length` m; its heading swings by `bend` rad with wavelengths of 150 to 260 m."""
+    """(N, 2) points, m, 1 m apart, of a street of `length` m that begins near the origin, towards +x on the whole.
+
+    Its heading swings by `bend` rad over 200 to 260 m, and by half of that over 150 to 190 m.
+    """
     s = np.arange(0, length + 1.0)
     heading = np.zeros_like(s)
     for wavelength, share in ((rng.uniform(200, 260), 1.0), (rng.uniform(150, 190), 0.5)):

@@ -205,7 +205,10 @@ def _by_ray(centres: Floats, radii: Floats, rays: Rays, hits: Hits) -> Iterator[
 
 
 def _meet_body(body: MovingMesh, which: NDArray[np.intp], rays: Rays, hits: Hits, stamp: float) -> None:
-    """Intersect the rays `which` with a body at its pose when each of them is fired; closer hits replace `hits`."""
+    """Intersect the rays `which` with a body at its pose when each of them is fired; closer hits replace `hits`.
+
+    rays : of `which` alone, city frame; stamp : s, of the scan, on the clock of the rays and the body
+    """
     # Between instants of a few milliseconds it moves on evenly, to micrometres; they do not hang on which rays are tried.
     share = (rays.times - stamp) / BODY_STEP
     at = share.astype(np.intp)

@@ -81,7 +81,7 @@ def _arc(corner: Floats, a: Floats, b: Floats, half: float, reach: float) -> Flo
 def eight(width: float, depth: float, radius: float) -> Floats:
     """Closed line (N, 2), m: up a street, round the block to its right, up it again, round the block to its left.
 
-    Blocks measure `width` x `depth` m between the middles of the streets.
+    Blocks measure `width` x `depth` m between the middles of the streets; radius : m, of the turns. The first street is along +y.
     """
     w, d = width, depth
     right = round_corners(

@@ -180,7 +180,10 @@ def _measurements(graph: PoseGraph) -> tuple[NDArray[np.intp], Floats, Floats]:
 
 
 def _fitting(error: Floats, own: Floats, drift: Floats) -> float:
-    """The factor on `drift` (P, n, n), beside `own`, with which the median error (P, n) has its expected size."""
+    """The factor on `drift` (P, n, n), beside `own`, with which the median error (P, n) has its expected size.
+
+    0 where `own` is enough, and `LARGEST` at most.
+    """
     typical = quantile(0.5, error.shape[1])
 
     def is_enough(factor: float) -> bool:

@@ -305,7 +305,10 @@ class Detector:
         return np.asarray(centre + TURN_STEP * np.arange(-count, count + 1))
 
     def _beyond(self, check: Verification, expected: Floats, uncertainty: RelativeUncertainty) -> str:
-        """Reason why a verified pose lies outside the gate of odometry; expected : (3,) m, of b relative to a, by odometry."""
+        """Reason why a verified pose lies outside the gate of odometry, empty where it does not.
+
+        expected : (3,) m, of b relative to a, by odometry
+        """
         assert check.T_a_b is not None
         shift = check.T_a_b[:3, 3] - expected
         turn = float(so3.angle(check.T_a_b[:3, :3]))

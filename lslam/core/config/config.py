@@ -155,7 +155,10 @@ def _over_preset(tree: Tree) -> Tree:
 
 
 def _whole(name: str, above: tuple[str, ...] = ()) -> Tree:
-    """Preset merged over its `base`; above : presets that led to it. Raises ConfigError for a cycle."""
+    """Preset merged over its `base`; above : presets that led to it.
+
+    Raises ConfigError for a cycle, unknown keys, and a base that is stated as odometry.preset.
+    """
     if name in above:
         raise ConfigError(f"presets {', '.join(above)}: one cannot stand on itself")
     tree = read_preset(name)

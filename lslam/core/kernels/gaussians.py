@@ -153,7 +153,8 @@ def breadth_of(
 ) -> float:
     """Smaller variance, m2, of points of covariance xx..zz perpendicular to the direction d of the beams that measured them.
 
-    It is the smaller eigenvalue of the covariance projected along d: the variance about the best plane that contains d.
+    It is the smaller eigenvalue of the covariance projected along d: the variance about the best plane that contains d. d has
+    any length; 0 for none.
     """
     d2 = dx * dx + dy * dy + dz * dz
     if d2 < 1e-12:
@@ -329,7 +330,10 @@ def coarsen(
     state: Longs,
     free: Ints,
 ) -> None:
-    """Fill an empty map of voxels of `size`, m, = factor * fine size with the moments of a finer map, which add up exactly."""
+    """Fill an empty map of voxels of `size`, m, = factor * fine size with the moments of a finer map, which add up exactly.
+
+    pool_size : slots of the finer map; voxels without room in the pool of the new one are left out
+    """
     fine = size / factor
     for j in range(pool_size):
         key = fine_keys[j]

@@ -59,7 +59,10 @@ def camera_of_files(name: str, info: CameraInfo, files: list[Path], stamps: Long
 
 
 def kitti_cameras(folder: Path, scans: list[Path], stamps_ns: Longs, T_cam0_lidar: Floats | None) -> list[Camera]:
-    """Rectified camera 2 of KITTI odometry, image_2 with P2 of calib.txt (else InputError), taken as the scanner looks ahead."""
+    """Rectified camera 2 of KITTI odometry, image_2 with P2 of calib.txt, taken as the scanner looks ahead; none without images.
+
+    Raises InputError where its calibration is missing.
+    """
     place = folder / "image_2"
     if not place.is_dir():
         return []

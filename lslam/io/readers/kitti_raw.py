@@ -381,7 +381,7 @@ def _samples(drive: Path) -> tuple[Oxts, Longs]:
 
 
 def _begin(drive: Path, first: int) -> tuple[int, str]:
-    """First scan's time, ns, and its file; times.txt counts from camera 0's first image. InputError without any file."""
+    """Time of frame `first`, ns, and the file that has it; times.txt counts from camera 0's image. InputError without any."""
     sync = drive.with_name(drive.name.replace("_extract", "_sync"))
     for name in ("image_00", "velodyne_points", "oxts"):
         path = sync / name / "timestamps.txt"

@@ -272,7 +272,10 @@ def _best_far(imu_rates: _GyroRates, scan_rates: Floats) -> tuple[float, float]:
 
 
 def _refine(imu_rates: _GyroRates, scan_rates: Floats, near: float) -> tuple[float, float]:
-    """The offset at which the rates differ least, and its standard deviation, by a parabola through the squared error."""
+    """The offset, s, at which the rates differ least, and its standard deviation, by a parabola through the squared error.
+
+    near : s, about where it is searched, a step either way; 0 and inf where the error has no minimum there
+    """
     costs = []
     for t in (near - STEP_S, near, near + STEP_S):
         a, b = _centre(scan_rates, imu_rates.rates(t))

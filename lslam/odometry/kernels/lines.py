@@ -138,7 +138,7 @@ def linearise_lines(
 ) -> None:
     """Add all edge points (S, 3), LiDAR frame, to H, g and facts, see `linearisation`.
 
-    Each takes the line voxel, of the eight around it, whose line passes nearest: residual across the line, variance =
+    Each takes the line voxel, of the eight around it, whose mean is nearest: residual across its line, variance =
     that of the voxel across its line + sigma2 + tilt at that distance along it, Geman-McClure weight of width `scale`.
     settings : voxel size, m; variance of a point, m2; points and floor of a line's variance, m2, see `line_of`
     search : octant cells and slots; `away2` (S,) takes the squared distance of each matched point to its line: those beyond

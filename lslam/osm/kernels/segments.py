@@ -202,6 +202,7 @@ def reach_out(
     """Begin and end, m, of a stretch of a line, extended by points of `every` (L, 3) at most `step`, m, beyond an end.
 
     Near a corner the neighbourhood of a point is two walls and no plane. Such points do not begin a segment, but extend it.
+    low, high : m, of the stretch along the line; tolerance : largest distance of a point from the line, m
     """
     new_low, new_high = low, high
     for j in range(len(every)):
@@ -219,6 +220,7 @@ def reach_out(
 def refit(flat: Floats, line: Floats, low: float, high: float, tolerance: float, agreement: float) -> float:
     """Replace `line` (4,) by the total least squares line of its points between `low` and `high`, m; returns their rms, m.
 
+    Without points it stays, and the rms is 0.
     line : x, y, m, of a point on it, and its unit normal; tolerance, agreement : as in `best_line`
     """
     n = sx = sy = xx = xy = yy = 0.0

@@ -203,7 +203,7 @@ def _examine_time(sequence: Sequence, imu: ImuStream, steps: Floats, median: flo
 
 
 def _examine_extrinsics(sequence: Sequence, findings: Findings) -> None:
-    """Check for extrinsics that are missing, or that the reader of a bag assumed."""
+    """Add a finding where the extrinsics of the IMU are unknown, so that readers take it to sit in the LiDAR, axes alike."""
     if sequence.calibration.T_lidar_imu is None:
         findings.add(
             "imu-extrinsics",
