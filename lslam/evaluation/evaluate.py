@@ -209,7 +209,7 @@ def _rotation_note(estimate: Floats, truth: Floats) -> list[str]:
 
 
 def _nearly_straight(truth: Floats, config: EvalConfig) -> list[str]:
-    """Note, in a list, where positions hardly constrain rotation about the path: aligned rotation errors are then unreliable"""
+    """Note, in a list, where positions hardly constrain rotation about the path: aligned rotation errors are then unreliable."""
     centred = truth[:, :3, 3] - truth[:, :3, 3].mean(axis=0)
     spread = np.linalg.svd(centred, compute_uv=False) / np.sqrt(len(truth))
     if not {"se3", "sim3"} & set(config.align) or not 1e-4 * spread[0] < spread[1] <= STRAIGHT_SHARE * spread[0]:
