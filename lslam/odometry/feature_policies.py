@@ -9,13 +9,15 @@ import numpy as np
 from lslam.core.config.odometry import RecoveryConfig, RegistrationConfig
 from lslam.core.types.arrays import Floats
 from lslam.core.types.state import Stateful
-from lslam.odometry.feature_solver import MIN_FEATURES, remap_solution
+from lslam.odometry.feature_map import MIN_LINE_POINTS
+from lslam.odometry.feature_solver import remap_solution
 from lslam.registration.attempt import RECOVER_M, Attempt, Policy
 from lslam.registration.history import History
 from lslam.registration.policies import best_by_non_ground, policies_of
 from lslam.registration.preprocessing.prepare import prepare_points
 from lslam.registration.registration import Registration
 from lslam.registration.result import RegistrationResult
+from lslam.registration.voxel_target import MIN_SOURCE_POINTS
 
 # In `pose_source`.
 ALL_POINTS = "all-points"
@@ -95,10 +97,6 @@ class AllPoints(Stateful):
         return icp
 
 
-# Planar points of one normal that constrain a direction well enough, as many as LOAM asks for a plane.
-ENOUGH_POINTS = 5
-
-
 class LessPlanar:
     """Less planar points in place of features that are too few or leave a direction unobserved.
 
@@ -109,7 +107,7 @@ class LessPlanar:
 
     def recover(self, attempt: Attempt, result: RegistrationResult) -> RegistrationResult:
         """Register less planar points if the result fails, has few inliers, or is degenerate on a map; else return `result`."""
-        target, are_few = attempt.target, result.inliers < MIN_FEATURES
+        target, are_few = attempt.target, result.inliers < MIN_SOURCE_POINTS
         is_degenerate = len(result.degenerate) > 0 and target.map is not None
         if result.ok and not are_few and not is_degenerate:
             return result
@@ -159,10 +157,10 @@ class AllPointsInstead:
 
 
 def holds_position(result: RegistrationResult, sigma: float) -> bool:
-    """Whether the position's largest variance is below that of `ENOUGH_POINTS` points of one normal, of `sigma`, m."""
+    """Whether the position's largest variance is below that of `MIN_LINE_POINTS` points of one normal, of `sigma`, m."""
     if not result.ok or result.covariance is None:
         return False
-    return float(np.linalg.eigvalsh(result.covariance[:3, :3])[-1]) < sigma**2 / ENOUGH_POINTS
+    return float(np.linalg.eigvalsh(result.covariance[:3, :3])[-1]) < sigma**2 / MIN_LINE_POINTS
 
 
 def feature_policies(config: RecoveryConfig) -> tuple[Policy, ...]:

@@ -24,8 +24,6 @@ from lslam.registration.residuals import PLANES_ALONE
 from lslam.registration.result import RegistrationResult
 
 NONE: Floats = np.zeros((0, 3))
-# Fewer inliers, ten per degree of freedom, are insignificant.
-MIN_FEATURES = 60
 # Scan-to-scan errors persist as velocity, without a map to correct them: the threshold of degeneracy is twice as high there.
 # Higher ones would call sparse scans degenerate in every direction.
 TIMES_ON_SCAN = 2.0

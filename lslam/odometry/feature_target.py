@@ -21,7 +21,6 @@ from lslam.odometry.feature_map import (
 )
 from lslam.odometry.feature_policies import AllPoints
 from lslam.odometry.feature_solver import (
-    MIN_FEATURES,
     NONE,
     FeatureNoise,
     ScanMatching,
@@ -43,6 +42,7 @@ from lslam.registration.policies import MUCH_RATIO, START_STEP_M, start_offsets
 from lslam.registration.preprocessing.features import Features
 from lslam.registration.preprocessing.ground import up_of
 from lslam.registration.result import RegistrationResult
+from lslam.registration.voxel_target import MIN_SOURCE_POINTS
 
 # m; of an edge across itself: it lies anywhere between two beams, and silhouettes move.
 EDGE_SIGMA_M = 0.15
@@ -94,7 +94,7 @@ class FeatureTarget(Target):
 
     def refusal(self, points: Features) -> str:
         """Too few features."""
-        if len(points.less_planes) + len(points.less_edges) >= MIN_FEATURES:
+        if len(points.less_planes) + len(points.less_edges) >= MIN_SOURCE_POINTS:
             return ""
         return f"only {len(points.edges)} edges and {len(points.planes)} planar points"
 

@@ -17,7 +17,8 @@ from lslam.odometry.feature_policies import feature_policies
 from lslam.odometry.feature_solver import joint_step, two_steps
 from lslam.odometry.feature_target import FeatureTarget, LoamVariant
 from lslam.registration.preprocessing.deskew import deskew_points
-from lslam.registration.preprocessing.features import FeaturePoints, Features, extract_features, lego_features
+from lslam.registration.preprocessing.features import FeaturePoints, Features, extract_features
+from lslam.registration.preprocessing.segments import lego_features
 from lslam.registration.registration import Registration
 from lslam.registration.result import RegistrationResult
 

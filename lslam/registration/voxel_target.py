@@ -15,14 +15,16 @@ from lslam.registration.alignment import MapAlignment
 from lslam.registration.attempt import Attempt, Target
 from lslam.registration.gaussian_map import FLOOR_M2, source_covariance
 from lslam.registration.history import History
-from lslam.registration.local_map import LastScan, LocalMap, make_map_scans
+from lslam.registration.keyframe_submap import KeyframeSubmap
+from lslam.registration.local_map import AllScans, LastKeyframes, LastScan, LocalMap, MapScans
 from lslam.registration.optimiser import KERNEL_MIN_M, Annealing, optimise
 from lslam.registration.preprocessing.prepare import PreparedPoints
 from lslam.registration.preprocessing.rings import ring_gap
 from lslam.registration.residuals import find_residual
 from lslam.registration.result import RegistrationResult
 
-MIN_SOURCE_POINTS = 30
+# Fewer points or features, ten per degree of freedom, are insignificant.
+MIN_SOURCE_POINTS = 60
 # Share of points with a ring spacing above a voxel from which on the coarse level is searched, too.
 SPARSE_SHARE = 0.1
 
@@ -109,3 +111,14 @@ class VoxelTarget(MapAlignment, Target):
             self._ring_gap = ring_gap(points.map_points)
         gaps: Floats = self._ring_gap * np.linalg.norm(points.source, axis=1)
         return gaps if (gaps > self.map.fine.size).mean() > SPARSE_SHARE else None
+
+
+def make_map_scans(config: RegistrationConfig) -> MapScans:
+    """The choice that `config.target` names."""
+    if config.target == "submap":
+        return KeyframeSubmap()
+    if config.target == "keyframe":
+        return LastKeyframes(config.keyframes, config.keyframe_m, float(np.deg2rad(config.keyframe_deg)))
+    if config.target in ("scan", "sample"):
+        return LastScan(takes_source=config.target == "sample")
+    return AllScans()

@@ -7,7 +7,7 @@ import pytest
 from analytic_scenes import pose_at
 from numpy.typing import NDArray
 
-from lslam.registration.local_map import HULL_KEYFRAMES, NEAREST_KEYFRAMES, KeyframeSubmap, hull_of, spacing_of
+from lslam.registration.keyframe_submap import HULL_KEYFRAMES, NEAREST_KEYFRAMES, KeyframeSubmap, hull_of, spacing_of
 from lslam.registration.preprocessing.prepare import PreparedPoints
 
 Floats = NDArray[np.float64]

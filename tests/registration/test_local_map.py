@@ -12,10 +12,11 @@ from lslam.core.config.input import PreprocessConfig
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.registration.alignment import MapAlignment
 from lslam.registration.gaussian_map import FLOOR_M2, GaussianMap
-from lslam.registration.local_map import LEAST_BREADTH, LocalMap, make_map_scans
+from lslam.registration.local_map import LEAST_BREADTH, LocalMap
 from lslam.registration.optimiser import optimise
 from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_points
 from lslam.registration.registration import Registration
+from lslam.registration.voxel_target import make_map_scans
 from lslam.simulation.scenarios import simulate
 
 ARRAYS = ("moments", "planes", "keys", "table")

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from lslam.core.errors import InputError
 from lslam.core.types.scan import Scan
 from lslam.registration.kernels import range_image
-from lslam.registration.preprocessing.features import Segments, extract_features, lego_features
+from lslam.registration.preprocessing.features import extract_features
+from lslam.registration.preprocessing.segments import Segments, lego_features
 from lslam.simulation import lidar
 from lslam.simulation.scenarios import simulate
 from lslam.simulation.scene_mesh import Surface
@@ -187,7 +188,7 @@ def test_a_steep_ramp_is_no_ground(monkeypatch: pytest.MonkeyPatch) -> None:
     ramp = (scan.points[:, 0] > 6.5) & (np.abs(scan.points[:, 1]) < 0.7 * scan.points[:, 0])
     assert ramp.sum() > 500
     assert segment_scan(scan).ground[ramp].mean() < 0.05
-    monkeypatch.setattr("lslam.registration.preprocessing.features.GROUND_ANGLE_DEG", 30.0)
+    monkeypatch.setattr("lslam.registration.preprocessing.segments.GROUND_ANGLE_DEG", 30.0)
     assert segment_scan(scan).ground[ramp].mean() > 0.9
 
 

@@ -12,8 +12,8 @@ from turned_sensor import TURNS, turn, turned_points
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.geometry import so3
 from lslam.core.types.scan import Scan
-from lslam.registration.preprocessing.features import lego_features
 from lslam.registration.preprocessing.ground import AXIS, Z, above_ground, find_up, ground_of, ground_share, up_of
+from lslam.registration.preprocessing.segments import lego_features
 from lslam.simulation.scenarios import simulate
 
 Points = NDArray[np.float32]
