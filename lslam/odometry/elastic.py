@@ -25,7 +25,7 @@ from lslam.registration.optimiser import STEP_M, STEP_RAD, Annealing, Correspond
 from lslam.registration.preprocessing.deskew import deskew_points
 from lslam.registration.preprocessing.prepare import PreparedPoints, subset
 from lslam.registration.residuals import find_residual
-from lslam.registration.result import MIN_MATCHES, RegistrationResult
+from lslam.registration.result import RegistrationResult
 
 
 @dataclass(frozen=True)
@@ -197,7 +197,7 @@ def register_elastic(
     """Both poses of a sweep by annealed Gauss-Newton; each step places the points anew at their own times.
 
     The pose at the stamp is interpolated between both ends. Degenerate directions are those of the sweep as a rigid whole.
-    Fewer than `MIN_MATCHES` matches end the iteration: the result is then not ok.
+    Fewer matches than a pose has unknowns end the iteration: the result is then not ok.
     """
     scale, iterations, converged, d, skew = annealing.start, 0, False, np.zeros((2, 6)), np.zeros((1, 6))
     sweep, shares = start, points.shares(start)
@@ -208,7 +208,7 @@ def register_elastic(
         iterations += 1
         prior = sweep.prior
         H, g, facts = points.linearise(prior, (scale, annealing.end, np.inf))
-        if facts[at.MATCHED] < MIN_MATCHES:
+        if facts[at.MATCHED] < d.shape[1]:
             break
         H, g = _about_own_place(H, g, sweep, shares, prior.pose[:3, 3])
         A, b = _of_ends_and_skew(H, g, shares)

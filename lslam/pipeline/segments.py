@@ -16,9 +16,8 @@ from lslam.backend.loops.verify import is_elsewhere
 from lslam.core.config import Config
 from lslam.core.geometry import noise, se3
 from lslam.core.types.arrays import Floats, Longs
-from lslam.core.types.scan_result import MotionCheck, ScanResult, motion_apart
+from lslam.core.types.scan_result import MOST_ACCELERATION_M_S2, MotionCheck, ScanResult, motion_apart
 from lslam.core.types.trajectory import Keyframe, Segment
-from lslam.odometry.inertial.constant_velocity import ConstantVelocity
 from lslam.odometry.integrity.alerts import LARGE, Alert, alerts, stamp_faults
 from lslam.pipeline.manifest import Manifest
 
@@ -155,7 +154,7 @@ def _vicinity(before: Session, session: Session) -> Vicinity:
     seconds = max(1e-9 * (first.stamp_ns - b.stamp_ns), 0.0)
     start, end = (before.T_town_session @ r.T_world_lidar for r in (a, b))
     steps = 1e9 * seconds / max(b.stamp_ns - a.stamp_ns, 1)
-    reach = 0.5 * ConstantVelocity.MAX_ACCELERATION * seconds**2
+    reach = 0.5 * MOST_ACCELERATION_M_S2 * seconds**2
     return Vicinity(end[:3, 3] + steps * (end[:3, 3] - start[:3, 3]), max(reach, LEAST_REACH))
 
 

@@ -18,9 +18,8 @@ from lslam.registration.history import History
 from lslam.registration.optimiser import KERNEL_DECAY, KERNEL_MIN_M, START_ITERATIONS, Annealing
 from lslam.registration.result import RegistrationResult
 
-# The kernel opens so many times its end width around a pose that is nearly right.
-NEAR_KERNEL_FACTOR = 2.0
-# Corrections of the prior beyond these are checked coarse to fine: priors of steady motion are better.
+# Around a pose that is nearly right the kernel opens so wide, and larger corrections of the prior are checked coarse to fine:
+# priors of steady motion are better.
 RECOVER_M, RECOVER_DEG = 0.3, 3.0
 
 
@@ -90,9 +89,9 @@ class Attempt:
 
     @property
     def annealing(self) -> Annealing:
-        """The kernel's schedule: it begins at the recent error of the motion prior, or near `KERNEL_MIN_M` with `is_near`."""
+        """The kernel's schedule: it begins at the recent error of the motion prior, or at `RECOVER_M` with `is_near`."""
         c, h = self.config, self.history
-        width = NEAR_KERNEL_FACTOR * KERNEL_MIN_M if self.is_near else h.threshold.width
+        width = RECOVER_M if self.is_near else h.threshold.width
         steps = c.max_iterations * self.target.times_steps
         if not self.is_near and h.starting > 0:
             steps = START_ITERATIONS

@@ -17,7 +17,7 @@ from lslam.core.kernels import linearisation as at
 from lslam.core.kernels.gauss_newton import UNSEEN_SHARE, step, step_on_surfaces, trimming_distance2
 from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.scan import LEVER_M
-from lslam.registration.result import MIN_MATCHES, RegistrationResult
+from lslam.registration.result import RegistrationResult
 
 # A step below these ends the iteration: a tenth of the noise of a point, and what that is of a turn.
 STEP_M = 1e-3
@@ -150,7 +150,7 @@ def optimise(
         width = (scale, end, gate2)
         for term in terms:
             term.linearise(term.points, term.target, term.settings, term.search, pose, width, sums)
-        if facts[at.MATCHED] < MIN_MATCHES:
+        if facts[at.MATCHED] < len(d):
             break
         is_moved, count, move, turn = advance(pose, sums, scale, bounds, limits.directions, d, weak)
         if not is_moved:

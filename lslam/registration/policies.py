@@ -15,11 +15,10 @@ from lslam.core.config.odometry import RecoveryConfig, RegistrationConfig
 from lslam.core.geometry import se3, so3
 from lslam.core.types.arrays import Bools, Floats, Points
 from lslam.registration.alignment import solve, upright_directions, voxel_terms
-from lslam.registration.attempt import NEAR_KERNEL_FACTOR, Attempt, Policy
+from lslam.registration.attempt import RECOVER_DEG, RECOVER_M, Attempt, Policy
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.history import is_more
 from lslam.registration.optimiser import (
-    KERNEL_MIN_M,
     START_ITERATIONS,
     Annealing,
     Correspondences,
@@ -27,7 +26,7 @@ from lslam.registration.optimiser import (
     optimise,
 )
 from lslam.registration.preprocessing.ground import Ground, Z, above_ground, ground_of, up_of
-from lslam.registration.preprocessing.prepare import PreparedPoints, subset, thin
+from lslam.registration.preprocessing.prepare import PreparedPoints, few_of, subset
 from lslam.registration.residuals import MEANS
 from lslam.registration.result import RegistrationResult
 
@@ -38,12 +37,9 @@ ALL_ALIKE = RegistrationConfig(sigma=NEAR_M, weak_share=0.0)
 # m above the ground: crash barriers are lower, along which a sensor's rings match best where nothing moved.
 HIGH_M = 1.2
 # m; from so far away they find each other: starts that far apart leave no gap, not even between piers of a facade.
-START_STEP_M = 1.0
+START_STEP_M = RegistrationConfig().kernel_max
 # A hand-held sensor turns at 100 deg/s, by 30 deg at every third scan; so far apart that 20 m away a step is left.
-TURN_STEP_DEG = 3.0
-START_TURNS_DEG = np.delete(np.arange(-30.0, 31.0, TURN_STEP_DEG), 10)
-# Every so many-th source point is enough to tell a good start from a bad one.
-SEARCH_STRIDE = 4
+START_TURNS_DEG = np.delete(np.arange(-30.0, 31.0, RECOVER_DEG), 10)
 # Along a bare wall the rings repeat best where nothing moved, by five percent: a start elsewhere must have more, and twice
 # as much where planes, the prior or both say otherwise.
 CLEAR_RATIO = 1.05
@@ -134,7 +130,6 @@ def best_by_non_ground(
         result = _best_start(attempt, result, non_ground, high)
     coarser = target.coarse_maps(points, T_prior)
     flat = on_ground(points, ground)
-    width = NEAR_KERNEL_FACTOR * KERNEL_MIN_M
 
     def place_upright(start: Floats) -> RegistrationResult:
         """Height and tilt by the ground, the rest by non-ground points, in turn as in LeGO-LOAM (Shan and Englot 2018)."""
@@ -143,7 +138,7 @@ def best_by_non_ground(
 
     def upright(pose: Floats) -> Floats:
         directions = upright_directions(pose, up_of(target.preprocess))
-        problem = target.problem(flat, pose, width, START_ITERATIONS, coarser, directions)
+        problem = target.problem(flat, pose, RECOVER_M, START_ITERATIONS, coarser, directions)
         return optimise(*problem).T_world_lidar
 
     def agreeing(at: RegistrationResult) -> Bools:
@@ -160,7 +155,7 @@ def best_by_non_ground(
     margin = CLEAR_RATIO if is_at_rest(result.T_world_lidar, last) else MUCH_RATIO
     if is_drawn or not is_much_more(most, agreeing(result), margin):
         return result
-    near = optimise(*target.problem(points, place, width, START_ITERATIONS, target.coarse_maps(points, place)))
+    near = optimise(*target.problem(points, place, RECOVER_M, START_ITERATIONS, target.coarse_maps(points, place)))
     judged = attempt.judge(near, place)
     if not judged.ok and not result.ok:
         return result
@@ -174,7 +169,7 @@ def _best_start(
 ) -> RegistrationResult:
     """The best of several starts: a few points on the coarse map show which are worth a whole registration."""
     target, count = attempt.target, len(high.source)
-    coarse_map, few = target.coarse_maps(attempt.points, attempt.T_prior)[0], thin(attempt.points, SEARCH_STRIDE)
+    coarse_map, few = target.coarse_maps(attempt.points, attempt.T_prior)[0], few_of(attempt.points)
     slow = target.slowly(2 * START_STEP_M)
     trials = [
         solve((coarse_map,), few, attempt.T_prior @ se3.make(np.eye(3), offset), slow, attempt.config)
@@ -202,7 +197,7 @@ def _likeliest(non_ground: NonGroundPoints, high: PreparedPoints, T_prior: Float
 def is_at_rest(pose: Floats, last: Floats) -> bool:
     """Whether the pose (4, 4) is so near to the last scan's that the sensor's own rings, on roofs or walls, explain it."""
     move, turn = se3.relative(last, pose)[:3, 3], so3.angle(se3.relative(last, pose)[:3, :3])
-    return bool(np.linalg.norm(move) < 2 * NEAR_M and turn < np.deg2rad(TURN_STEP_DEG))
+    return bool(np.linalg.norm(move) < 2 * NEAR_M and turn < np.deg2rad(RECOVER_DEG))
 
 
 def is_much_more(ours: Bools, others: Bools, margin: float = MUCH_RATIO) -> bool:

@@ -12,17 +12,17 @@ from numpy.typing import NDArray
 
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.geometry import se3
+from lslam.core.geometry.noise import RIGHT_PROBABILITY, quantile
+from lslam.core.kernels.linearisation import OUTLIER_SIGMAS
 from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.core.types.state import Stateful
 from lslam.registration.alignment import upright_directions
 from lslam.registration.gaussian_map import FLOOR_M2
-from lslam.registration.local_map import LEAST_BREADTH
+from lslam.registration.local_map import COARSE_FACTOR, LEAST_BREADTH
 from lslam.registration.optimiser import pose_change
 from lslam.registration.preprocessing.ground import ground_of, up_of
 from lslam.registration.result import RegistrationResult
 
-# Squared Mahalanobis distance of six dimensions that two poses of one place exceed once in a thousand scans.
-SAME_POSE_CHI2 = 22.5
 # Rest lasts longer than the time that the last motion took to show, by this factor.
 REST_RATIO = 2
 
@@ -41,6 +41,7 @@ class RestDetector(Stateful):
 
     def __init__(self, sigma: float) -> None:
         self.sigma = sigma
+        self._same_pose_chi2 = quantile(RIGHT_PROBABILITY, 6)
         self._reference: Floats | None = None
         # Scans near the reference; scans that it took to leave the one before.
         self._stayed = self._last_stay = 0
@@ -63,13 +64,12 @@ class RestDetector(Stateful):
         d = pose_change(T, reference)
         if d[:3] @ d[:3] + result.lever_arm**2 * (d[3:] @ d[3:]) > self.sigma**2:
             return False
-        return float(d @ np.linalg.solve(2.0 * C, d)) < SAME_POSE_CHI2
+        # Once in a thousand scans two poses of one place differ by more.
+        return float(d @ np.linalg.solve(2.0 * C, d)) < self._same_pose_chi2
 
 
-# Voxels between surfaces of different things.
-THINGS_APART_VOXELS = 2.5
 # Squared sigmas beyond which a point is no inlier, so that two points at least make a vote.
-INLIER_CHI2 = 9.0
+INLIER_CHI2 = OUTLIER_SIGMAS**2
 # Squared sigmas by which a point tells two poses apart.
 TELLING_CHI2 = 0.5
 
@@ -137,7 +137,7 @@ class PlanWalls:
         telling = np.flatnonzero(np.abs(gain) > TELLING_CHI2)
         if not len(telling):
             return Votes(0, 0)
-        things = _connect(here[telling, :2], THINGS_APART_VOXELS * self._voxel_size)
+        things = _connect(here[telling, :2], COARSE_FACTOR * self._voxel_size)
         sums = np.bincount(things, gain[telling])
         return Votes(*(int(np.count_nonzero(sign * sums > INLIER_CHI2)) for sign in (1, -1)))
 

@@ -13,9 +13,6 @@ from lslam.core.types.arrays import Floats
 from lslam.core.types.imu import MotionState
 from lslam.core.types.motion_prior import MotionPrior
 
-# A pose has six degrees of freedom.
-MIN_MATCHES = 6
-
 
 @dataclass(frozen=True)
 class RegistrationResult:
@@ -85,7 +82,7 @@ class RegistrationResult:
         is_finite = bool(np.isfinite(pose).all() and np.isfinite(step).all())
         # Root mean square, m, by information.
         lever = math.sqrt(max(f[at.LEVER] / max(f[at.INFORMATION], 1e-300), 1e-6))
-        has_covariance = is_finite and int(f[at.MATCHED]) >= MIN_MATCHES
+        has_covariance = is_finite and int(f[at.MATCHED]) >= len(step)
         return cls(
             pose if is_finite else T_start,
             ok=is_finite,

@@ -37,7 +37,7 @@ from lslam.core.types.scan import Scan
 from lslam.odometry import create_odometry, feature_policies
 from lslam.odometry.frontend import tracker
 from lslam.odometry.frontend.tracker import ScanInput, Tracker
-from lslam.odometry.inertial.constant_velocity import ConstantVelocity
+from lslam.odometry.inertial import constant_velocity
 from lslam.registration import alignment, local_map, policies, residuals
 from lslam.simulation.scenarios import simulate
 
@@ -74,7 +74,7 @@ WITHOUT: dict[str, dict[str, Variant]] = {
         "MUCH_RATIO": ((), ((policies, "MUCH_RATIO", 1.0),)),
         "agreement": (("registration.min_agreement=0",), ()),
         "possible jumps": ((), ((tracker, "fault", lambda pose, stamp_ns, last: ""),)),
-        "bounded acceleration": ((), ((ConstantVelocity, "MAX_ACCELERATION", np.inf),)),
+        "bounded acceleration": ((), ((constant_velocity, "MOST_ACCELERATION_M_S2", np.inf),)),
     },
     "loam": {
         **MAP,

@@ -63,10 +63,7 @@ NOT_OF_IT = {
     "registration/kernels/curvature.py LESS_EDGE", "registration/kernels/curvature.py NEITHER",
     "registration/kernels/curvature.py LESS_PLANE", "registration/kernels/curvature.py PLANE",
     "registration/preprocessing/features.py MAY_BE_EDGE", "registration/preprocessing/features.py MAY_BE_FLAT",
-    "registration/preprocessing/features.py MAY_BE_PLANE", "registration/preprocessing/features.py _BASELINE",
-    "registration/preprocessing/features.py _TOLERANCE", "registration/preprocessing/features.py _SAME",
-    "registration/preprocessing/features.py _FLOOR_REACH", "registration/preprocessing/features.py _LOWEST",
-    "registration/preprocessing/features.py _FLOOR_SHARE",
+    "registration/preprocessing/features.py MAY_BE_PLANE", "registration/keyframe_submap.py",
     "odometry/integrity/alerts.py AXES", "registration/preprocessing/ground.py Z",
     "odometry/inertial/integrate.py PERFECT", "odometry/inertial/gyroscope.py MOUNTING",
     "registration/optimiser.py EVERYWHERE", "odometry/feature_solver.py NONE",
@@ -75,8 +72,11 @@ NOT_OF_IT = {
     "core/kernels/gaussians.py HAND", "core/kernels/gaussians.py LIVE", "odometry/frontend/scene_scale.py USUAL_RANGE_M",
     "odometry/integrity/pair_registration.py _ROWS", "odometry/integrity/pair_registration.py _COLUMNS",
     "odometry/inertial/gyroscope.py MOUNTING_SIGMA", "odometry/inertial/gyroscope.py OFFSET_SIGMA",
-    "odometry/inertial/gyroscope.py OFFSET_WALK", "registration/result.py LEAST_MATCHED",
-    "odometry/inertial/imu_estimate.py PLACE_NOISE", "odometry/inertial/imu_estimate.py TURN_NOISE",
+    "odometry/inertial/gyroscope.py OFFSET_WALK", "odometry/inertial/imu_cleaning.py WHEEL_GAP_S",
+    "odometry/inertial/initialise.py GIVEN_ACCEL_BIAS", "odometry/inertial/initialise.py GIVEN_GYRO_BIAS",
+    "odometry/inertial/initialise.py GIVEN_SPEED", "odometry/inertial/initialise.py MOST_BIAS_ERROR_RAD_S",
+    "odometry/feature_policies.py CONSTRAINED_SCANS", "odometry/inertial/imu_estimate.py PLACE_NOISE",
+    "odometry/inertial/imu_estimate.py TURN_NOISE",
 }  # fmt: skip
 # Keys of sections that every scan passes, those that the scene's size decides aside.
 KEYS = {
@@ -88,10 +88,10 @@ KEYS = {
     ),
 }  # fmt: skip
 CONFIG = {"preprocess": "core/config/input.py", "registration": "core/config/odometry.py"}
-COSINES = {"UPRIGHT"}
+COSINES = {"NEAR_Z"}
 # Shares of which 1 is the whole, and ratios of which 1 is none.
 LACK = {"FORGETTING_FACTOR", "LESS", "USUAL types", "ALIKE inertial", "KERNEL_DECAY", "COARSE_DECAY"}
-EXCESS = {"CLEAR_RATIO", "MUCH_RATIO", "MORE_POINTS_RATIO", "LONE_CHECK_RATIO", "PILED_RATIO"}
+EXCESS = {"CLEAR_RATIO", "MUCH_RATIO", "MORE_POINTS_RATIO", "PILED_RATIO"}
 FACTORS = {"half": 0.5, "double": 2.0}
 
 

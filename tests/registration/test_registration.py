@@ -109,7 +109,7 @@ def test_a_corridor_keeps_the_prior_along_itself_scan_after_scan() -> None:
 def test_too_few_points_keep_the_prior_with_a_reason(n: int) -> None:
     registration = in_room()
     prior = pose_at((0.3, 0.0, 0.0))
-    result = registration.register(np.full((n, 3), 5.0) + np.arange(n)[:, None], prior)
+    result = registration.register(np.full((n, 3), 5.0) + np.arange(n)[:, None] * [1.0, 0.0, 0.0], prior)
     assert not result.ok
     assert not result.converged
     assert f"{n} usable points, {MIN_SOURCE_POINTS} needed" in result.reason

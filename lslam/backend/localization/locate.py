@@ -36,9 +36,9 @@ from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.state import Stateful
 from lslam.registration.acceptance import Acceptance, correction
 from lslam.registration.alignment import MapAlignment
-from lslam.registration.attempt import NEAR_KERNEL_FACTOR
+from lslam.registration.attempt import RECOVER_M
 from lslam.registration.history import UsualAgreement
-from lslam.registration.optimiser import COARSE_KERNEL_M, KERNEL_MIN_M, optimise
+from lslam.registration.optimiser import COARSE_KERNEL_M, optimise
 from lslam.registration.preprocessing.ground import ahead_of
 from lslam.registration.preprocessing.prepare import PreparedPoints
 from lslam.registration.result import RegistrationResult
@@ -303,7 +303,7 @@ class MapFollower(Stateful):
         A prior that is wider than the widest kernel serves as initial guess only.
         """
         c = self.config.registration
-        width = max(self._uncertainty_m(), NEAR_KERNEL_FACTOR * KERNEL_MIN_M)
+        width = max(self._uncertainty_m(), RECOVER_M)
         if start is self.T and width <= c.kernel_max:
             information = np.asarray(np.linalg.inv(self.covariance), np.float64)
             return optimise(*alignment.problem(points, start, width, c.max_iterations, information=information))

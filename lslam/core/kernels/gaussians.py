@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from lslam.core.kernels.jit import inline, kernel
 from lslam.core.kernels.linalg import plane_of
-from lslam.core.kernels.voxel import AHEAD, MASK, OFFSET, hash_key, index_of, pack, place_of
+from lslam.core.kernels.voxel import BLOCK, MASK, OFFSET, hash_key, index_of, pack, place_of
 
 Floats = NDArray[np.float64]
 Longs = NDArray[np.int64]
@@ -206,11 +206,11 @@ def insert(
     slot = -1
     limit = float(OFFSET - 2)
     mask = len(table) - 1
-    ahead, likely, offsets = np.empty(AHEAD, np.int64), np.empty(AHEAD, np.int64), np.empty((AHEAD, 3))
-    views = np.empty((AHEAD, 3))
-    for begin in range(0, n, AHEAD):
+    ahead, likely, offsets = np.empty(BLOCK, np.int64), np.empty(BLOCK, np.int64), np.empty((BLOCK, 3))
+    views = np.empty((BLOCK, 3))
+    for begin in range(0, n, BLOCK):
         some = 0
-        for i in range(begin, min(begin + AHEAD, n)):
+        for i in range(begin, min(begin + BLOCK, n)):
             a, b, c = float(points[i, 0]), float(points[i, 1]), float(points[i, 2])
             x = R[0, 0] * a + R[0, 1] * b + R[0, 2] * c + t[0]
             y = R[1, 0] * a + R[1, 1] * b + R[1, 2] * c + t[1]

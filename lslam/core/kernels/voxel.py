@@ -14,10 +14,9 @@ from lslam.core.kernels.linalg import extent
 
 OFFSET = 1 << 20
 MASK = (1 << 21) - 1
-# Number of points that are looked up together in a table larger than the processor's caches.
-AHEAD = 64
-# Number of points whose cells are computed together, in arrays that stay in the nearest cache.
-BLOCK = 256
+# Number of points whose cells are computed, and looked up in a table larger than the caches, together: as many questions as
+# memory answers side by side, in arrays that stay in the nearest cache.
+BLOCK = 64
 
 
 @inline

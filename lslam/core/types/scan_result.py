@@ -67,12 +67,17 @@ class ScanEquations:
     g: Floats
 
 
-# m/s and rad/s: trains and small aircraft are slower, and racing drones turn less.
-FASTEST_M_S, FASTEST_RAD_S = 150.0, 20.0
-# What explains less than this part of what is usual, or less than a share of the points, is rejected.
-USUAL, FEWEST = 0.7, 0.15
-# m and rad; what is known no better is open: a motion of which scans say no more, a pose that no scan supports.
-OPEN_M, OPEN_RAD = 0.5, float(np.deg2rad(2.0))
+# m/s, and of turns what that is at `LEVER_M`: trains and small aircraft are slower.
+FASTEST_M_S = 150.0
+FASTEST_RAD_S = FASTEST_M_S / LEVER_M
+# m/s2, twice gravity: a faster change is an error of registration.
+MOST_ACCELERATION_M_S2 = 20.0
+# What explains less than this part of what is usual is rejected.
+USUAL = 0.7
+# m, and of turns what that is at `LEVER_M`; what is known no better is open: a motion of which scans say no more, a pose that
+# no scan supports.
+OPEN_M = 0.5
+OPEN_RAD = OPEN_M / LEVER_M
 # m, of a point at `LEVER_M`: two motions of a pair of scans that differ by less are one.
 SAME_M = 0.2
 # m, likewise: poses that move by less stand. Registration errs by no more, and all that drives moves more in half a second.
@@ -108,7 +113,7 @@ class MotionCheck:
     @property
     def is_conclusive(self) -> bool:
         """Whether enough points are inliers, and the rotation is constrained well enough, to accept it."""
-        return self.agreement >= max(USUAL * self.usual, FEWEST) and LEVER_M * float(np.max(self.sigma[3:])) < SAME_M
+        return self.agreement >= USUAL * self.usual and LEVER_M * float(np.max(self.sigma[3:])) < SAME_M
 
     @property
     def is_open(self) -> bool:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.core.kernels.jit import inline, kernel
-from lslam.core.kernels.voxel import AHEAD, BLOCK
+from lslam.core.kernels.voxel import BLOCK
 
 AXIS_BITS = 21
 HALF = 1 << (AXIS_BITS - 1)
@@ -187,9 +187,9 @@ def add_rows(
     has_tags : whether three columns are tags
     """
     mask = slots.shape[0] - 1
-    likely = np.empty(AHEAD, np.int64)
-    for begin in range(0, more.shape[0], AHEAD):
-        part = more[begin : begin + AHEAD]
+    likely = np.empty(BLOCK, np.int64)
+    for begin in range(0, more.shape[0], BLOCK):
+        part = more[begin : begin + BLOCK]
         # Table and rows are far larger than the processor's caches: a batch of rows is fetched before a branch depends on one.
         for k in range(part.shape[0]):
             likely[k] = slots[slot_of(part[k, 0], mask)]

@@ -81,12 +81,6 @@ def scene_scale(sequence: Sequence) -> float:
     return min(largest, 1.0) or 1.0
 
 
-# Scans of which the largest serves: the first message may be a sliver.
-MOUNTING_SCANS = 3
-# s; gravity is averaged over the first of the drive: swings of a hand and most of what a car accelerates cancel.
-LEVELLING_S = 10.0
-
-
 def with_up(sequence: Sequence, config: Config) -> Config:
     """The configuration with `preprocess.up` set where the sensor is tilted by more than 45 deg; else unchanged."""
     if config.preprocess.up is not None:
@@ -104,27 +98,27 @@ def with_up(sequence: Sequence, config: Config) -> Config:
 def _up_of(sequence: Sequence, config: Config) -> Up | None:
     """Up direction by the first scan, and by the IMU if the run uses it; None without a scan.
 
-    Where the first scan does not confirm that z is up, the largest of a few scans decides.
+    Where the first scan does not confirm that z is up, the largest of the first scans decides: one may be a sliver.
     """
     plain = config.preprocess.model_copy(update={"remove_ground": False, "denoise": False})
     scans = (scan for _, scan in readable(range(len(sequence)), sequence.scan))
     first = next(scans, None)
     if first is None:
         return None
-    gravity = _gravity_up(sequence, int(sequence.stamps_ns[0])) if config.imu.use else None
+    gravity = _gravity_up(sequence, config.imu.start_s) if config.imu.use else None
     up = find_up(clean_points(first.points, plain), gravity)
     if up.tilt_deg == 0.0 and up.source != "axis":
         return up
-    largest = max((first, *islice(scans, MOUNTING_SCANS - 1)), key=len)
+    largest = max((first, *islice(scans, config.registration.start_scans - 1)), key=len)
     return find_up(clean_points(largest.points, plain), gravity)
 
 
-def _gravity_up(sequence: Sequence, begin_ns: int) -> Floats | None:
-    """(3,) up in the LiDAR frame as the IMU measures it; None where it measures no gravity."""
+def _gravity_up(sequence: Sequence, seconds: float) -> Floats | None:
+    """(3,) up in the LiDAR frame as the IMU measures it in the first `seconds`, s; None where it measures no gravity."""
     imu, T_lidar_imu = sequence.imu, sequence.calibration.T_lidar_imu
     if imu is None or len(imu) < 2:
         return None
-    begin, end = np.searchsorted(imu.stamps_ns, [begin_ns, begin_ns + round(1e9 * LEVELLING_S)])
+    begin, end = np.searchsorted(imu.stamps_ns, int(sequence.stamps_ns[0]) + np.array([0, round(1e9 * seconds)]))
     if end - begin > 1:
         imu = ImuStream(imu.stamps_ns[begin:end], imu.accel[begin:end], imu.gyro[begin:end])
     if not np.isfinite(imu.accel).all() or gravity_unit(imu)[1] is None:

@@ -24,10 +24,6 @@ from lslam.odometry.stationary import StationaryDetector
 from lslam.registration.gaussian_map import FLOOR_M2
 from lslam.registration.result import RegistrationResult
 
-# Two registrations from different initial guesses are the same minimum if their distance is below this part of the distance
-# between the prior and the first.
-SAME_MINIMUM_RATIO = 0.3
-
 # Registers the scan that is being tracked from a motion prior.
 Register = Callable[..., RegistrationResult]
 
@@ -285,8 +281,8 @@ def _nearest(
     With perceptual aliasing a wide search converges at the wrong place. If both initial guesses lead to the same minimum, it
     is accepted against the IMU.
     """
-    away, off = (apart(pose, alignment.T_world_lidar) for pose in (near.T_world_lidar, expected.pose))
-    source = alignment if near.ok and away < SAME_MINIMUM_RATIO * off else denial
+    is_same = apart(near.T_world_lidar, alignment.T_world_lidar) < apart(near.T_world_lidar, expected.pose)
+    source = alignment if near.ok and is_same else denial
     # Where nothing is found near by, the first registration enters with the points as they are seen from there.
     base = near
     if not near.ok:

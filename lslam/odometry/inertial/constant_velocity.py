@@ -15,6 +15,7 @@ from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.imu import GravityDirection, ImuState
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Span
+from lslam.core.types.scan_result import MOST_ACCELERATION_M_S2
 from lslam.core.types.state import State, Stateful
 from lslam.registration.preprocessing.deskew import knots_over
 from lslam.registration.result import RegistrationResult
@@ -143,8 +144,6 @@ class ConstantVelocity(Stateful, MotionModel):
 
     # Bound of extrapolation, in last steps: the speed after a longer pause is unknown.
     MAX_STRETCH = 5.0
-    # m/s2, twice gravity: a faster change is a registration error, unless the next step confirms it.
-    MAX_ACCELERATION = 20.0
     STATE: ClassVar[tuple[str, ...]] = ("_instant_ns", "_pose", "_twist", "_step_s", "_velocity")
     TRANSIENT: ClassVar[tuple[str, ...]] = ("_predicted",)
 
@@ -226,7 +225,8 @@ class ConstantVelocity(Stateful, MotionModel):
         if before is not None and self._step_s > 0:
             expected = self._twist / self._step_s
             change, again = velocity[:3] - expected[:3], velocity[:3] - before[:3]
-            most = self.MAX_ACCELERATION * (step + self._step_s) / 2
+            # Unless the next step confirms it.
+            most = MOST_ACCELERATION_M_S2 * (step + self._step_s) / 2
             size = float(np.linalg.norm(change))
             if size > most and np.linalg.norm(again) > most:
                 velocity = np.concatenate([expected[:3] + change * most / size, velocity[3:]])

@@ -10,17 +10,14 @@ import numpy as np
 from lslam.core.geometry import se3
 from lslam.core.kernels.linearisation import OUTLIER_SIGMAS
 from lslam.core.types.arrays import Bools, Floats, Longs
-from lslam.core.types.scan_result import OPEN_M, OPEN_RAD, SAME_M, USUAL, MotionCheck
-from lslam.odometry.integrity.pair_registration import EMPTIED_SHARE, is_within
+from lslam.core.types.scan_result import MOST_ACCELERATION_M_S2, OPEN_M, OPEN_RAD, SAME_M, USUAL, MotionCheck
+from lslam.odometry.integrity.pair_registration import EMPTIED_SHARE, MORE_POINTS_RATIO, is_within
 
 # Consistent checks in a row, two seconds of them, and least deviations, m and rad: few rings constrain tilt poorly.
 IN_A_ROW = 4
 LEAST_DEVIATION: Floats = np.array([0.06, 0.06, 0.08, *np.deg2rad([0.3, 0.3, 0.12])])
 # One check is enough where it says so much more, and clearly explains more of the points.
 LARGE: Floats = np.repeat([OPEN_M, OPEN_RAD], 3)
-LONE_CHECK_RATIO = 1.15
-# m/s2, five times gravity, over so many m: nothing that carries a LiDAR is accelerated so, but scans out of order are.
-MOST_ACCELERATION, LEAST_JERK_M = 50.0, 0.3
 # Checks in a row between standing and moving: one is chance.
 OPEN_IN_A_ROW = 2
 AXIS_NAMES = ("ahead", "to the left", "up", "of roll", "of pitch", "of yaw")
@@ -71,7 +68,7 @@ def _noise(apart: Floats) -> Floats:
 
 def _stretches(checks: list[MotionCheck], apart: Floats, sigma: Floats, axis: int) -> list[tuple[int, int]]:
     """Ranges of checks along one axis whose deviation `apart` (m or rad) is significant in a row, or large in a single check."""
-    is_better = np.array([check.agreement > LONE_CHECK_RATIO * check.claimed_agreement for check in checks])
+    is_better = np.array([check.agreement > MORE_POINTS_RATIO * check.claimed_agreement for check in checks])
     is_large = is_better & (np.abs(apart) > LARGE[axis] + 2 * OUTLIER_SIGMAS * sigma)
     stretches = []
     for begin, end in _runs(np.where(np.abs(apart) > LEAST_DEVIATION[axis], np.sign(apart), 0)):
@@ -226,7 +223,7 @@ def _velocity_changes(positions: Floats, steps: Floats) -> tuple[Floats, Floats]
 
 def _is_jump(change: Floats, between: Floats) -> Bools:
     """Whether nothing that carries a sensor changes its velocity so much, m/s, in such a time, s."""
-    return np.asarray((change / between > MOST_ACCELERATION) & (change * between > LEAST_JERK_M))
+    return np.asarray((change / between > MOST_ACCELERATION_M_S2) & (change * between > OPEN_M))
 
 
 def _is_by_stamps(positions: Floats, steps: Floats) -> Bools:

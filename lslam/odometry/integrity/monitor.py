@@ -25,7 +25,7 @@ from lslam.odometry.integrity.pair_registration import (
 )
 from lslam.registration.history import UsualAgreement
 from lslam.registration.preprocessing.deskew import deskew_points
-from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_points, small_room, thin
+from lslam.registration.preprocessing.prepare import PreparedPoints, few_of, prepare_points, small_room
 
 # A pair of scans is so long apart, s, and the sensor moves by less than this part of the median range between them, where
 # scans lie closer.
@@ -34,10 +34,6 @@ LAG_S, REACH_SHARE = 0.45, 0.75
 MAX_EXTRAPOLATION_S = 3 * LAG_S
 # s; a longer pause between two scans is a break.
 PAUSE_S = 1.0
-# Points that make the planes of the first scan, and of the last scan those that are laid on them.
-PLANE_POINTS, LAID_POINTS = 5000, 1200
-# Another motion than the one found from the claim must explain so many times more points.
-MORE_POINTS_RATIO = 1.1
 
 
 @dataclass(frozen=True)
@@ -141,13 +137,12 @@ class IntegrityMonitor(Stateful):
     def _view(
         self, position: int, scan: Scan, prepared: object, result: ScanResult, sweep: MotionPrior
     ) -> ReferenceScan:
-        """The scan as reference: its deskewed source points, at most about `PLANE_POINTS` of them, with pose and median range."""
+        """The scan as reference: its deskewed source points, with pose and median range."""
         if not (self._is_prepared and isinstance(prepared, PreparedPoints)):
             prepared = prepare_points(scan.points, self._preprocess, scan.index, scan.times)
-        points = thin(prepared, 1 + len(prepared.source) // PLANE_POINTS)
-        source = deskew_points(points.source, points.source_times, sweep)
+        source = deskew_points(prepared.source, prepared.source_times, sweep)
         return ReferenceScan(
-            position, result.stamp_ns, result.T_world_lidar, source, points.scatter, median_range(source)
+            position, result.stamp_ns, result.T_world_lidar, source, prepared.scatter, median_range(source)
         )
 
     def _empty_share(self, first: ReferenceScan, last: ReferenceScan, scan: Scan) -> float:
@@ -163,13 +158,13 @@ class IntegrityMonitor(Stateful):
         claimed = se3.relative(first.pose, last.pose)
         seconds = (last.stamp_ns - first.stamp_ns) * 1e-9
         pair = self._pair
-        pair.begin(first.source, thin(last.points, 1 + len(last.source) // LAID_POINTS))
+        pair.begin(first.source, few_of(last.points))
         near_claim = pair.near(claimed)
         hypotheses = [near_claim]
         is_odd = is_still(claimed) or self._usual.is_less(near_claim.agreement)
         # No vehicle comes to rest faster than by gravity, or its tyres do not hold.
         if not is_still(claimed) and (self._may_stand or self._speed < GRAVITY * seconds):
-            hypotheses.append(pair.at_rest())
+            hypotheses.append(pair.at(np.eye(4)))
         if self._motion is None:
             hypotheses.append(pair.far(np.eye(4)))
         elif (expected := self._extrapolate(seconds)) is not None:
@@ -178,7 +173,7 @@ class IntegrityMonitor(Stateful):
                 hypotheses.append(pair.near(expected))
         if is_odd and (is_still(claimed) or self._usual.is_less(max(h.agreement for h in hypotheses))):
             hypotheses.append(pair.far(claimed))
-        best, rival = best_of(hypotheses, MORE_POINTS_RATIO)
+        best, rival = best_of(hypotheses)
         if best.sigma is None:
             return
         usual = self._usual.usual

@@ -39,8 +39,8 @@ from lslam.registration.result import RegistrationResult
 
 # Edge of a cell of directions, rad: two rings of sixteen beams, a hundred shots.
 CELL_RAD = float(np.deg2rad(5.0))
-# Points that tell the directions of a scan, and that fill a cell.
-POINTS, FILLING = 20_000, 3
+# Points that fill a cell of directions.
+FILLING = 3
 # Share of the directions that empty: far from the few per cent of dropouts, and from the half and more of a cloud that leaves.
 EMPTIED_SHARE = 0.25
 # Cells are numbered by row, from the pole below upwards.
@@ -61,9 +61,9 @@ def directions(points: Floats) -> Longs:
 
 def filled_directions(points: NDArray[np.floating]) -> Longs:
     """Numbers of the cells of `directions` that hold some of the points (N, 3), m."""
-    few = points[:: 1 + len(points) // POINTS, :3].astype(np.float64)
-    ranges = np.linalg.norm(few, axis=1)
-    cells, filling = np.unique(directions(few[np.isfinite(ranges) & (ranges > 0)]), return_counts=True)
+    cloud = points[:, :3].astype(np.float64)
+    ranges = np.linalg.norm(cloud, axis=1)
+    cells, filling = np.unique(directions(cloud[np.isfinite(ranges) & (ranges > 0)]), return_counts=True)
     return np.asarray(cells[filling >= FILLING])
 
 
@@ -84,8 +84,8 @@ SETTINGS = RegistrationConfig()
 EDGE_SHARE, SMALLEST_M, LARGEST_M = 0.2, 0.3, COARSE_FACTOR * SETTINGS.voxel_size
 # Half of an edge is how far a plane reaches.
 CAPTURE_EDGES = 0.4
-# Steps that settle a scan which lies within its noise of where it was.
-STEPS_AT_REST = 4
+# Another motion than the claimed one must explain so many times more points.
+MORE_POINTS_RATIO = 1.1
 
 
 @dataclass(frozen=True)
@@ -165,10 +165,6 @@ class PairRegistration:
         """The motion that fits best some metres around a start (4, 4)."""
         return self._lay(start, Annealing(COARSE_KERNEL_M, KERNEL_MIN_M, COARSE_DECAY, START_ITERATIONS))
 
-    def at_rest(self) -> MotionHypothesis:
-        """The motion that fits if the sensor stands: its points lie within their noise of where they were."""
-        return self._lay(np.eye(4), Annealing(KERNEL_MIN_M, KERNEL_MIN_M, KERNEL_DECAY, STEPS_AT_REST))
-
     def at(self, motion: Floats) -> MotionHypothesis:
         """How the scan fits at a motion (4, 4)."""
         return self._lay(motion, Annealing(KERNEL_MIN_M, KERNEL_MIN_M, KERNEL_DECAY, 1))
@@ -181,13 +177,13 @@ class PairRegistration:
         return MotionHypothesis(motion, on_planes, int(np.isin(cells, self._view).sum()))
 
 
-def best_of(hypotheses: Sequence[MotionHypothesis], more: float) -> tuple[MotionHypothesis, MotionHypothesis | None]:
-    """The motion with the most points, the first one unless another has `more` times as many, and its rival.
+def best_of(hypotheses: Sequence[MotionHypothesis]) -> tuple[MotionHypothesis, MotionHypothesis | None]:
+    """The motion with the most points, the first one unless another has many more (`MORE_POINTS_RATIO`), and its rival.
 
     A rival is another motion whose own points are at least half as many as those of the best.
     """
     best = max(hypotheses, key=lambda h: h.result.inliers)
-    if best.result.inliers <= more * hypotheses[0].result.inliers:
+    if best.result.inliers <= MORE_POINTS_RATIO * hypotheses[0].result.inliers:
         best = hypotheses[0]
     rivals = [h for h in hypotheses if not h.is_same(best) and 2 * h.own_points(best) >= best.own_points(h)]
     return best, max(rivals, key=lambda h: h.own_points(best), default=None)

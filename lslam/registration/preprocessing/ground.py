@@ -34,8 +34,9 @@ TRIPLES = 200
 GROUND_SLOPE = 0.2
 # m above the ground that still counts as ground: ruts and kerbs.
 GROUND_TOLERANCE_M = 0.25
-# Planes steeper than 40 deg against the expected horizontal are walls or roofs.
-UPRIGHT = float(np.cos(np.deg2rad(40.0)))
+# Cosine of 45 deg: planes steeper against the expected horizontal are walls or roofs, and nearer to up, z serves to look for the
+# ground about.
+NEAR_Z = float(np.cos(np.deg2rad(45.0)))
 Z = np.array([0.0, 0.0, 1.0])
 
 
@@ -106,13 +107,13 @@ def _levelling(points: NDArray[np.float32], tolerance: float, half: int) -> tupl
     if len(low) < 3:
         return np.eye(3), -np.inf
     triples = np.random.default_rng(0).integers(0, len(low), (TRIPLES, 3))
-    plane = ground.best_plane(low, triples, tolerance, UPRIGHT)
+    plane = ground.best_plane(low, triples, tolerance, NEAR_Z)
     if not plane.any():
         return np.eye(3), -np.inf
     near = low[np.abs(low @ plane[:3] + plane[3]) <= tolerance]
     _, _, axes = np.linalg.svd(near - near.mean(0), full_matrices=False)
     normal = axes[2] * (1.0 if axes[2, 2] > 0 else -1.0)
-    if normal[2] < UPRIGHT:
+    if normal[2] < NEAR_Z:
         normal = plane[:3]
     axis = np.cross(normal, [0.0, 0.0, 1.0])
     sine = float(np.linalg.norm(axis))
@@ -127,8 +128,6 @@ def warm_up() -> None:
     above_ground(floor)
 
 
-# Cosine of 45 deg: within it z is close enough to up for everything that looks for the ground.
-NEAR_Z = float(np.cos(np.deg2rad(45.0)))
 # The ground fills more than half of the hemisphere below the sensor: a plane that fills less is a wall, or no whole floor.
 GROUND_SHARE = 0.5
 # Extent, in cells to each side; sectors about the foot of the sensor.

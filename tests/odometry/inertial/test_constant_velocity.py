@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from lslam.core.geometry import se3
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Span
+from lslam.core.types.scan_result import MOST_ACCELERATION_M_S2
 from lslam.odometry.inertial.constant_velocity import ConstantVelocity
 
 TENTH = 100_000_000
@@ -122,7 +123,7 @@ def test_the_first_sweep_has_no_motion_to_refine(span: Span) -> None:
 
 def test_a_velocity_change_is_accepted_when_it_persists() -> None:
     """At 30 m/s, one scan half a metre too far: 50 m/s2 no sensor has. What the next step says again is believed."""
-    most = ConstantVelocity.MAX_ACCELERATION * 0.1**2
+    most = MOST_ACCELERATION_M_S2 * 0.1**2
 
     def predicted(places: list[float]) -> float:
         motion = ConstantVelocity()
