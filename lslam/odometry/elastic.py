@@ -197,7 +197,8 @@ def register_elastic(
     """Both poses of a sweep by annealed Gauss-Newton; each step places the points anew at their own times.
 
     The pose at the stamp is interpolated between both ends. Degenerate directions are those of the sweep as a rigid whole.
-    Fewer matches than a pose has unknowns end the iteration: the result is then not ok.
+    Fewer matches than a pose has unknowns end the iteration: the result is then not ok. `weak_share` as in
+    `solve_guarded_step`.
     """
     scale, iterations, converged, d, skew = annealing.start, 0, False, np.zeros((2, 6)), np.zeros((1, 6))
     sweep, shares = start, points.shares(start)

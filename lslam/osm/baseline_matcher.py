@@ -166,7 +166,10 @@ def lay_building(walls: Floats, scan: Floats, prior: Floats) -> FlatFit | None:
 def _align(
     source: Floats, target: Floats, prior: Floats, voxel: float, residual: Literal["ndt", "vgicp"]
 ) -> FlatFit | None:
-    """Pose of the points `source` (N, 2) in `target` (M, 2), m, registered from `prior` (3,); None for a poor overlap."""
+    """Pose of the points `source` (N, 2) in `target` (M, 2), m, registered from `prior` (3,); voxel : edge, m.
+
+    None for too few points, for a poor overlap, and far from the prior.
+    """
     from scipy.spatial import cKDTree
 
     if min(len(source), len(target)) < LEAST_POINTS:

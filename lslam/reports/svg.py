@@ -230,6 +230,7 @@ def line_chart(
     """Lines over a common abscissa; `marks` are abscissas of failed scans. Empty text when no value is finite.
 
     bands : areas behind the lines; where one is wider than the lines need, as at the start of a filter, it is cut off
+    zero : whether the ordinate includes 0; whole_x : ticks of the abscissa at whole numbers only
     by : what of a scan the abscissa is
     """
     x_span, y_span = span_of([line.x for line in lines]), span_of([*(line.y for line in lines), *_tail(bands)], zero)

@@ -298,9 +298,10 @@ class MapFollower(Stateful):
         return MapFix(self.T, self.P, "held", result.overlap, result.inlier_share, (move, turn))
 
     def _align(self, alignment: MapAlignment, points: PreparedPoints, start: Floats) -> RegistrationResult:
-        """Registration with the predicted pose's information as prior, and a kernel as wide as that pose is uncertain.
+        """Registration from `start`; from the predicted pose, `self.T`, with its information as prior and a kernel as wide as
+        it is uncertain.
 
-        A prior that is wider than the widest kernel serves as initial guess only.
+        A prior that is wider than the widest kernel serves as initial guess only, as does any other `start`.
         """
         c = self.config.registration
         width = max(self._uncertainty_m(), RECOVER_M)

@@ -122,7 +122,10 @@ def _part_number(path: Path) -> tuple[str, int] | None:
 
 
 def _missing_by_metadata(path: Path, files: list[Path]) -> list[str]:
-    """Files that ROS 2's `metadata.yaml`, of any version, lists but that are missing; empty if it cannot be read."""
+    """A sentence, in a list, on files that ROS 2's `metadata.yaml`, of any version, lists but that are missing.
+
+    Empty without such, and where the file cannot be read.
+    """
     if not path.is_dir() or not (path / METADATA).is_file():
         return []
     from ruamel.yaml import YAML

@@ -74,7 +74,10 @@ def kitti_cameras(folder: Path, scans: list[Path], stamps_ns: Longs, T_cam0_lida
 
 
 def kitti_raw_cameras(folder: Path) -> list[Camera]:
-    """Rectified camera 2 of a KITTI raw drive; raises InputError without calibration or stamps, or for `extract` drives."""
+    """Rectified camera 2 of a KITTI raw drive; none without images.
+
+    Raises InputError without calibration or stamps, or for `extract` drives.
+    """
     place = folder / "image_02"
     if not (place / "data").is_dir():
         return []

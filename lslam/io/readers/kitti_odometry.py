@@ -24,7 +24,10 @@ KIND = "kitti-odometry"
 
 
 def locate(folder: Path) -> tuple[Path, str] | None:
-    """Sequence folder in or at `folder`, and why it is one, or None. Raises InputError that lists several."""
+    """Sequence folder in or at `folder`, and why it is one, or None.
+
+    Raises InputError that lists several, and for a folder `sequences` without any.
+    """
     if (folder / "velodyne").is_dir():
         return folder, "it has velodyne/, as KITTI odometry sequences do"
     for sequences in (folder / "sequences", folder / "dataset" / "sequences"):

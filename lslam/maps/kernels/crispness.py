@@ -79,7 +79,7 @@ def moments(
 
 @kernel
 def cell_keys(points: NDArray[np.float64], low: NDArray[np.float64], size: float) -> NDArray[np.int64]:
-    """(N,) packed cell of each point, z fastest, cells counted from `low` (3,)."""
+    """(N,) packed cell of each point, z fastest, cells of edge `size`, m, counted from `low` (3,), m, below all points."""
     keys = np.empty(len(points), np.int64)
     for i in range(len(points)):
         keys[i] = pack(

@@ -309,6 +309,7 @@ def vote(
     only when its height differs by `step` times the tolerance at most: it does not confirm the foot of an object.
 
     points : (N, 3), m, in their own frame; T : (4, 4) from there to the frame of the image
+    low, inverse : of the image, as in `nearest_ranges`
     margin, slope : the tolerance is `margin` + `slope` r, m, for a point at range r
     later : number of images still to come, this one included; a point with more hits than that above its free counts is
         skipped, since its majority is decided

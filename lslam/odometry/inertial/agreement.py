@@ -252,7 +252,10 @@ def _no_fit(imu_rates: _GyroRates, scan_rates: Floats, correlation: float) -> Im
 def _beyond(
     imu_rates: _GyroRates, scan_rates: Floats, edge_s: float, at_zero: float, at_edge: float
 ) -> ImuRefusedError:
-    """The ImuRefusedError for rotations whose correlation grows up to the largest tested offset of the stamps."""
+    """The ImuRefusedError for rotations whose correlation grows up to the largest tested offset of the stamps.
+
+    edge_s : that offset; at_zero, at_edge : correlation without an offset and with that
+    """
     what = (
         f"its turns fit those of the scans the better the farther its stamps are moved (correlation {at_zero:.2f}, moved by "
         f"{edge_s:+.2f} s {at_edge:.2f})"

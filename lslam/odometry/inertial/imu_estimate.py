@@ -38,7 +38,10 @@ class PredictionErrors(Stateful):
         self._pairs: list[tuple[float, float]] = []
 
     def observe(self, own: float, steady: float) -> tuple[float, float] | None:
-        """Add the errors of a scan; returns both medians over the newest scans if the sensor is clearly worse, else None."""
+        """Add the errors of a scan; returns both medians over the newest scans if the sensor is clearly worse, else None.
+
+        own, steady : m, of its prediction and of that by constant velocity
+        """
         self._pairs.append((own, steady))
         if len(self._pairs) < self.JUDGED:
             return None

@@ -193,7 +193,7 @@ class WheelMotion(ConstantVelocity):
         return bool(apart(steady, reckoning.wheels.pose, LEVER_M) < apart(steady, registered, LEVER_M))
 
     def _judge(self, own: float, steady: float) -> None:
-        """Refuse wheels whose prediction errors (m) are clearly larger than those of constant velocity (`steady`)."""
+        """Refuse wheels whose prediction errors (`own`, m) are clearly larger than those of constant velocity (`steady`, m)."""
         worse = self.errors.observe(own, steady)
         if worse is not None and not self.refusal:
             self.refusal = (

@@ -51,7 +51,10 @@ def _add_point(
     variance: float,
     c2: float,
 ) -> None:
-    """Add a point-to-point residual e (m) to H and g; r : point relative to the sensor, c2 : squared width of Geman-McClure."""
+    """Add a point-to-point residual e (m) to H and g.
+
+    r : m, point relative to the sensor; variance : m2, of e along each axis; c2 : m2, squared width of Geman-McClure
+    """
     d2 = ex * ex + ey * ey + ez * ez
     robust = c2 / (c2 + d2)
     robust *= robust
@@ -80,7 +83,7 @@ def _add_plane(
     variance: float,
     c2: float,
 ) -> float:
-    """Add a point-to-plane residual e (m) along the unit normal n to H and g; returns its weight."""
+    """Add a point-to-plane residual e (m) along the unit normal n to H and g; returns its weight; r, c2 : as in `_add_point`."""
     robust = c2 / (c2 + e * e)
     robust *= robust
     w = robust / variance

@@ -44,7 +44,8 @@ def line_of(
 ) -> None:
     """Recompute the cached line of voxel `slot` if its moments changed: point, unit direction, variance across, tilt variance.
 
-    The last column of `lines` is `NO_LINE` for too few points or points that are not elongated.
+    The last column of `lines` is `NO_LINE` for fewer points than `min_points` or points that are not elongated.
+    size : edge of a voxel, m; floor : m2, added to the variance across
     """
     s = moments[slot]
     key = keys[slot]

@@ -72,7 +72,7 @@ def integrate(
 def _readings(
     stamps_ns: NDArray[np.int64], values: Floats, s: int, now: int, then: int, bias: Floats, out: Floats
 ) -> None:
-    """out (3,) <- mean reading less the bias between two instants, with no sample between them; `s` is the next sample.
+    """out (3,) <- mean reading less the bias from `now` to `then`, ns, with no sample between them; `s` is the next sample.
 
     Linear between samples, constant before the first and after the last.
     """

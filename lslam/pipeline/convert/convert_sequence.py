@@ -99,6 +99,7 @@ class _Lidar:
 class _Source:
     """Scans of a sequence in order, deskewed on request; damaged ones are logged, counted and left out.
 
+    trajectory : of the LiDAR, to deskew by; None writes points as they are; on_scan : called after each scan
     lidars : the LiDARs to write into a bag, the leading one first
     """
 
