@@ -220,6 +220,7 @@ def _place(
     The position is that of one match: the nearest to `first` that is as accurate as the map and agrees with the others. The
     heading is estimated from all matches. A single match of few walls, or of a house drawn with a wrong heading, would rotate
     the run by degrees, which looks like drift of odometry.
+    sigma : (3,) m, m, rad, standard deviations of the run's place before the matches correct it
     """
     poses, matches = run.planar, [first, *(match for match in accepted if match is not first)]
     numbers = [match.keyframe for match in matches]

@@ -290,7 +290,7 @@ def plane_chart(
     in the style `backdrop_style`.
 
     `points` (K, 2) are marked as failures; `dots` are points (K, 2) in a style each, one group over
-    the other; `by` says whose world it is. Empty text when nothing is finite.
+    the other; `by` says whose world it is; `width` and `tallest` as for `_fit_frame`. Empty text when nothing is finite.
     """
     xs, ys = [t.xy[:, 0] for t in tracks], [t.xy[:, 1] for t in tracks]
     if backdrop is not None:
@@ -327,7 +327,10 @@ def plane_chart(
 
 
 def _fit_frame(x_span: tuple[float, float], y_span: tuple[float, float], width: int, tallest: int, pad: float) -> Frame:
-    """Frame with one scale for x and y, its height chosen for the data."""
+    """Frame with one scale for x and y, its height chosen for the data.
+
+    width, tallest : of the drawing and its greatest height, SVG units; pad : share of the data's size free on each side
+    """
     margins_x = MARGIN_LEFT + MARGIN_RIGHT
     margins_y = MARGIN_TOP + MARGIN_BOTTOM
     size = np.array([x_span[1] - x_span[0], y_span[1] - y_span[0]])

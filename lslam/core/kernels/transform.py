@@ -27,6 +27,7 @@ def deskew(
 ) -> None:
     """Write points (N, 3), m, transformed by the pose at their times (N,), s, to `out` (N, 3).
 
+    A time that is not finite counts as 0.
     knots : (K, 3, 4) transforms at start, start + step, ..., s. Matrices are interpolated linearly between two knots, and
         extrapolated from the outer pair before the first and after the last one.
     """

@@ -140,7 +140,10 @@ def _agree(
 
 
 def _read(clock: TimeColumn, sample: Sample, rate_hz: float, unit: str | None, reference: str | None) -> _TimeReading:
-    """Possible readings of one scan's times, judged by most of its points. Raises InputError when no unit fits."""
+    """Possible readings of one scan's times, judged by most of its points; unit, reference : as stated, None to find them.
+
+    Raises InputError when no unit fits.
+    """
     usable = is_usable(sample.cloud, clock.values)
     values, points = clock.values[usable], sample.cloud.points[usable]
     period_ns = 1e9 / rate_hz
