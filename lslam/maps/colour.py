@@ -113,7 +113,8 @@ class MapColourer:
     ) -> int:
         """Add an image (height, width, 3) by its pose (4, 4). Returns the number of points that it shows.
 
-        others : (N, 3) each, world, m: further points that are in the way, of what passes while the image is taken
+        others : (N, 3) each, world, m: points measured shortly before and after the image is taken. All are in the way of the
+            map; a point of the map through which one of them was seen is of something that passes, and was not there
         weight : of the image among others, above 0: less for one that is blurred
         """
         from lslam.maps.kernels.views import collect, splat
@@ -122,19 +123,24 @@ class MapColourer:
         T = np.eye(4)
         T[:3, :3], T[:3, 3] = R.T, -portable.product(R.T, centre[:, None])[:, 0]
         runs = self._runs[self._in_view(lens, centre, R[:, 2])]
+        view = T, lens.parameters, self._spacing, self._reach
         depth = np.full(image.shape[:2], np.inf, np.float32)
-        splat(self._points, runs, T, lens.parameters, self._spacing, self._reach, depth)
+        behind = np.full(image.shape[:2], -np.inf, np.float32)
         for points in others:
-            near = (points - self._origin).astype(np.float32)
-            splat(near, np.array([[0, len(near)]]), T, lens.parameters, self._spacing, self._reach, depth)
+            near, own = (points - self._origin).astype(np.float32), np.full(image.shape[:2], np.inf, np.float32)
+            splat(
+                near, np.zeros(near.shape, np.int8), np.array([[0, len(near)]]), *view, np.full_like(own, -np.inf), own
+            )
+            depth = np.minimum(depth, own)
+            behind = np.maximum(behind, np.where(own < np.inf, own, -np.inf))
+        # What both saw through hides nothing; to be coloured, a point has to be there for both.
+        splat(self._points, self._normals, runs, *view, np.where(depth < np.inf, depth, -np.inf), depth)
         shown = collect(
             self._points,
             self._normals,
             runs,
-            T,
-            lens.parameters,
-            self._spacing,
-            self._reach,
+            *view,
+            behind,
             depth,
             np.ascontiguousarray(image),
             self.images,

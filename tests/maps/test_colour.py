@@ -102,6 +102,22 @@ def test_further_points_in_the_way_hide_the_map() -> None:
     assert (colourer.result().colours == BLUE).all()
 
 
+def test_what_has_driven_off_is_not_coloured_by_what_stands_behind_and_hides_it_no_more() -> None:
+    """The map has a car that only the first image shows; scans about the others see the wall through it."""
+    car, points = wall(5, (-1, 1), (-1, 1)), wall(8, (-3, 3), (-2, 2))
+    colourer = MapColourer(ArrayCloud.of(np.concatenate([car, points])), SPACING, 50.0)
+    with_car = plain(BLUE)
+    half = 120 * 1.1 / 5
+    with_car[int(79.5 - half) : int(81.5 + half), int(99.5 - half) : int(101.5 + half)] = RED
+    colourer.add(with_car, LENS, at(0), [np.concatenate([car, points])])
+    for k in range(1, 4):
+        shown = colourer.add(plain(BLUE), LENS, at(0.02 * k), [points])
+        assert shown == len(points)
+    colours = colourer.result().colours
+    assert (colours[: len(car)] == RED).all()
+    assert (np.abs(colours[len(car) :].astype(int) - BLUE) <= 2).all()
+
+
 def test_views_are_drawn_by_their_solid_angle_whatever_their_order() -> None:
     points = wall(20, (-2, 2), (-2, 2))
     near, far = (plain(RED), at(14)), (plain(BLUE), at(2))

@@ -97,19 +97,67 @@ def _seen_from(
     return u, v, np.sqrt(x * x + y * y + z * z)
 
 
+@inline
+def _cosine(
+    points: NDArray[np.float32], normals: NDArray[np.int8], i: int, T: NDArray[np.float64], far: float
+) -> float:
+    """Cosine between the normal of point i, in 127ths, and the ray to it; 1 where the normal is unknown, 0."""
+    nx, ny, nz = normals[i, 0] / 127.0, normals[i, 1] / 127.0, normals[i, 2] / 127.0
+    if not nx * nx + ny * ny + nz * nz > 0.0:
+        return 1.0
+    # The camera's place in the frame of the points is -R^T t.
+    cx = points[i, 0] + T[0, 0] * T[0, 3] + T[1, 0] * T[1, 3] + T[2, 0] * T[2, 3]
+    cy = points[i, 1] + T[0, 1] * T[0, 3] + T[1, 1] * T[1, 3] + T[2, 1] * T[2, 3]
+    cz = points[i, 2] + T[0, 2] * T[0, 3] + T[1, 2] * T[1, 3] + T[2, 2] * T[2, 3]
+    return float(min(abs(nx * cx + ny * cy + nz * cz) / far, 1.0))
+
+
+@inline
+def _resolution(cosine: float, spacing: float) -> float:
+    """m by which ranges in one pixel differ on one surface: the spacing, and what a neighbour on a slant is nearer."""
+    return spacing * (1.0 + 0.5 * math.sqrt(2.0) * math.sqrt(1.0 - cosine * cosine) / cosine)
+
+
+@inline
+def _is_gone(
+    points: NDArray[np.float32],
+    normals: NDArray[np.int8],
+    i: int,
+    T: NDArray[np.float64],
+    spacing: float,
+    u: float,
+    v: float,
+    far: float,
+    behind: NDArray[np.float32],
+) -> bool:
+    """Whether something is seen through point i, at pixel u, v and range `far`, in the ranges `behind`: it is not there."""
+    height, width = behind.shape
+    if not (u > -0.5 and v > -0.5 and u < width - 0.5 and v < height - 0.5):
+        return False
+    beyond = behind[int(np.rint(v)), int(np.rint(u))] - far
+    if not beyond > spacing:
+        return False
+    return bool(beyond > _resolution(_cosine(points, normals, i, T, far), spacing))
+
+
 @kernel
 def splat(
     points: NDArray[np.float32],
+    normals: NDArray[np.int8],
     runs: NDArray[np.int64],
     T: NDArray[np.float64],
     lens: NDArray[np.float64],
     spacing: float,
     reach: float,
+    behind: NDArray[np.float32],
     depth: NDArray[np.float32],
 ) -> None:
     """Enter the points of `runs` (R, 2), begin and end, into the buffer of ranges `depth` (height, width), m.
 
     T : (4, 4) camera from points; spacing, reach : m; farther points are left out
+    normals : (N, 3) in 127ths, 0 where unknown
+    behind : (height, width) m, range measured about when the image was taken, -inf where none; points that it passes through
+        are left out
     """
     height, width = depth.shape
     for r in range(len(runs)):
@@ -120,6 +168,8 @@ def splat(
                 continue
             half_u, half_v = 0.5 * spacing / far * lens[1], 0.5 * spacing / far * lens[2]
             if not (u + half_u > -0.5 and v + half_v > -0.5 and u - half_u < width - 0.5 and v - half_v < height - 0.5):
+                continue
+            if _is_gone(points, normals, i, T, spacing, u, v, far, behind):
                 continue
             first_u, last_u = max(int(np.rint(u - half_u)), 0), min(int(np.rint(u + half_u)), width - 1)
             first_v, last_v = max(int(np.rint(v - half_v)), 0), min(int(np.rint(v + half_v)), height - 1)
@@ -138,6 +188,7 @@ def collect(
     lens: NDArray[np.float64],
     spacing: float,
     reach: float,
+    behind: NDArray[np.float32],
     depth: NDArray[np.float32],
     image: NDArray[np.uint8],
     view: int,
@@ -149,10 +200,11 @@ def collect(
     """Enter the colour of every point that the image shows into the views kept of it. Returns the number of such points.
 
     A point is seen if nothing lies before it by more than the map's depth resolution: its spacing, and on a slanted surface what
-    a neighbour whose splat covers the same pixel is nearer. Where the number of views exceeds the room, priority sampling
-    (Duffield et al. 2007) keeps each in proportion to the solid angle that the point's surface covers in it.
+    a neighbour whose splat covers the same pixel is nearer; and if nothing `behind` is seen through it. Where the number of
+    views exceeds the room, priority sampling (Duffield et al. 2007) keeps each in proportion to the solid angle that the point's
+    surface covers in it.
 
-    normals : (N, 3) in 127ths, 0 where unknown; depth : from `splat`; view : number of the image
+    normals, behind : as of `splat`; depth : from it; view : number of the image
     ranks, views, colours : (N, K), (N, K) and (N, K, 3) of the views kept; rank 0 where there is none
     """
     height, width = depth.shape
@@ -165,19 +217,13 @@ def collect(
             if not (u > -0.5 and v > -0.5 and u < width - 0.5 and v < height - 0.5):
                 continue
             row, column = int(np.rint(v)), int(np.rint(u))
-            nx, ny, nz = normals[i, 0] / 127.0, normals[i, 1] / 127.0, normals[i, 2] / 127.0
-            cosine = 1.0
-            if nx * nx + ny * ny + nz * nz > 0.0:
-                # The camera's place in the frame of the points is -R^T t.
-                cx = points[i, 0] + T[0, 0] * T[0, 3] + T[1, 0] * T[1, 3] + T[2, 0] * T[2, 3]
-                cy = points[i, 1] + T[0, 1] * T[0, 3] + T[1, 1] * T[1, 3] + T[2, 1] * T[2, 3]
-                cz = points[i, 2] + T[0, 2] * T[0, 3] + T[1, 2] * T[1, 3] + T[2, 2] * T[2, 3]
-                cosine = min(abs(nx * cx + ny * cy + nz * cz) / far, 1.0)
+            cosine = _cosine(points, normals, i, T, far)
             pixels = cosine * lens[1] * lens[2] * (spacing / far) ** 2
             if pixels < 1.0:
                 continue
-            tangent = np.sqrt(1.0 - cosine * cosine) / cosine
-            if far - depth[row, column] > spacing * (1.0 + 0.5 * np.sqrt(2.0) * tangent):
+            if far - depth[row, column] > _resolution(cosine, spacing):
+                continue
+            if _is_gone(points, normals, i, T, spacing, u, v, far, behind):
                 continue
             count += 1
             rank = weight * pixels / _share(i, view)
