@@ -1,9 +1,9 @@
 """What Girolimetto found of parameters, judged by its eight studies on fresh seeds.
 
-    python tests/benchmarks/findings.py [--runs FOLDER] [--studies share,skip-frames] [--seeds 100-104] [--write docs/theses.md]
+    python tests/benchmarks/findings.py STUDY [--runs FOLDER] [--seeds 100-104] [--write docs/theses.md]
 
-Runs `lslam sweep STUDY --seeds ...` for each, two at once; an idle machine with two cores takes three quarters of an
-hour. Runs in FOLDER are kept and gone on with.
+Runs `lslam sweep STUDY --seeds ...`, two runs at once. Runs in FOLDER are kept and gone on with.
+Each study has a table of its own, so that one can be renewed where there is no time for all.
 """
 
 from __future__ import annotations
@@ -43,21 +43,17 @@ def swept(study: str, seeds: list[int], folder: Path) -> list[StudyResult]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--studies", default=",".join(study_names()))
+    parser.add_argument("study", choices=study_names())
     parser.add_argument("--runs", type=Path, metavar="FOLDER")
     tables.offer(parser)
     args = parser.parse_args()
-    studies, seeds, rows = args.studies.split(","), tables.numbers(args.seeds), []
+    seeds = tables.numbers(args.seeds)
     with tempfile.TemporaryDirectory() as scratch:
-        for study in studies:
-            for result in swept(study, seeds, args.runs or Path(scratch)):
-                rows += [[study, v.text, v.outcome, v.numbers] for v in result.verdicts]
-    scenes = {place.scenario for study in studies for place in find_study(study).sequences}
-    caption = (
-        f"Girolimetto's presets on the simulated flight `{', '.join(sorted(scenes))}`, {tables.seeds_named(seeds)}. A "
-        "verdict asks for evidence on both sides of what is stated, beyond what the seeds scatter."
-    )
-    tables.table("findings", caption, ["study", "the thesis", "verdict", "here"], rows, args.write)
+        results = swept(args.study, seeds, args.runs or Path(scratch))
+    rows = [[verdict.text, verdict.outcome, verdict.numbers] for result in results for verdict in result.verdicts]
+    scenes = ", ".join(sorted({place.scenario for place in find_study(args.study).sequences}))
+    caption = f"Study `{args.study}`: Girolimetto's presets on the simulated flight `{scenes}`, {tables.seeds_named(seeds)}."
+    tables.table(f"findings-{args.study}", caption, ["the thesis", "verdict", "here"], rows, args.write)
 
 
 if __name__ == "__main__":
