@@ -52,7 +52,9 @@ def main() -> None:
         results = swept(args.study, seeds, args.runs or Path(scratch))
     rows = [[verdict.text, verdict.outcome, verdict.numbers] for result in results for verdict in result.verdicts]
     scenes = ", ".join(sorted({place.scenario for place in find_study(args.study).sequences}))
-    caption = f"Study `{args.study}`: Girolimetto's presets on the simulated flight `{scenes}`, {tables.seeds_named(seeds)}."
+    caption = (
+        f"Study `{args.study}`: Girolimetto's presets on the simulated flight `{scenes}`, {tables.seeds_named(seeds)}."
+    )
     tables.table(f"findings-{args.study}", caption, ["the thesis", "verdict", "here"], rows, args.write)
 
 
