@@ -13,14 +13,16 @@ import numpy as np
 
 from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.imu import GRAVITY, ImuState, ImuStream
+from lslam.core.types.scan import LEVER_M
 from lslam.core.types.state import State, Stateful
 from lslam.odometry.inertial.gyroscope import INNOVATION_SIGMAS, Gyroscope
 from lslam.odometry.inertial.integrate import Increments, integrate
 from lslam.odometry.kernels import kalman
 from lslam.odometry.kernels.rotation import vector_between
 
-# Registration from scan to scan, at the least: m and rad, one sigma.
-PLACE_SIGMA, TURN_SIGMA = 0.007, np.deg2rad(0.05)
+# Registration from scan to scan, at the least: m, and of turns what that is at `LEVER_M`, one sigma.
+PLACE_SIGMA = 0.007
+TURN_SIGMA = PLACE_SIGMA / LEVER_M
 # Random walk of gravity in the world of a registration that drifts, m/s2 per sqrt(s).
 GRAVITY_WALK = 5e-3
 GRAVITY_SIGMA_M_S2 = 0.03  # m/s2, over the Earth

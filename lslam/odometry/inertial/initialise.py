@@ -11,27 +11,25 @@ from lslam.core.config.odometry import ImuConfig
 from lslam.core.kernels.linearisation import OUTLIER_SIGMAS
 from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.imu import GRAVITY, ImuStream
+from lslam.core.types.scan import LEVER_M
 from lslam.core.types.scan_result import FASTEST_M_S, STILL_M
 from lslam.odometry.inertial.agreement import LEAST_OFFSET_S, check_agreement
 from lslam.odometry.inertial.gyroscope import Gyroscope, ImuNoise
 from lslam.odometry.inertial.imu_cleaning import IMU_GAP_S, ImuRefusedError, clean, covers, gaps
 from lslam.odometry.inertial.imu_estimate import BIAS, DOWN, WORSE_RATIO, ImuEstimate
+from lslam.odometry.kernels.rotation import apart
 
 # Prior sigmas: any vehicle's speed; consumer devices' biases; a bias by the mean turn.
 ANY_SPEED, ANY_ACCEL_BIAS, ANY_GYRO_BIAS, MEAN_GYRO_BIAS = FASTEST_M_S / OUTLIER_SIGMAS, 0.5, 0.1, 0.02
 # Given biases: axes up to 2 % askew (a consumer device's data sheet) show as much of gravity as one more: two sigma.
-# A bias that is given was measured over minutes; one second that looks like standing may be a slow turn.
-GIVEN_ACCEL_BIAS, GIVEN_GYRO_BIAS, STANDING_GYRO_BIAS, GIVEN_SPEED = 0.1, 2e-4, 2e-3, 0.3
+# A bias that is given was measured over minutes.
+GIVEN_ACCEL_BIAS, GIVEN_GYRO_BIAS, GIVEN_SPEED = 0.1, 2e-4, 0.3
 # A given bias may differ from the mean rate error of the first seconds by so much, rad/s: misaligned axes add to that.
 MOST_BIAS_ERROR_RAD_S = 0.03
-# A standing sensor: spread of rates (rad/s) and forces (m/s2) over a second.
-STILL_RATE, STILL_FORCE = 0.02, 0.3
 # What gravity may be off beyond what a bias explains, m/s2.
 LEVEL_SIGMA_M_S2 = 0.3
 # The speed at the first scan is read off so many seconds: longer, and errors of the force add up.
 SPEED_S = 0.8
-# Gravity is read off so many seconds: shorter, and swings of the sensor take its place.
-GRAVITY_S = 3.0
 
 
 @dataclass(frozen=True)
@@ -108,7 +106,7 @@ def start(
     usable = replace(cleaned.imu, stamps_ns=cleaned.imu.stamps_ns + moved)
     part, opening = covered_stretches(first, usable)
     _refuse_sign(usable, T_lidar_imu, part, agreement.gyro_bias)
-    guess, is_static = _first_guess(usable, T_lidar_imu, part.stamps_ns, part.poses, config, agreement.gyro_bias)
+    guess = _first_guess(usable, T_lidar_imu, part, config, agreement.gyro_bias)
     options = config.estimate_extrinsics, config.estimate_offset
     guess = replace(guess, gyroscope=guess.gyroscope.with_calibration(*options))
     estimate = _learn(usable, T_lidar_imu, guess, part, opening, config)
@@ -122,6 +120,7 @@ def start(
             *options
         )
         estimate = _learn(usable, T_lidar_imu, replace(guess, gyroscope=device), part, opening, config)
+    is_static = _is_static(part)
     notes.append("IMU aligned " + ("while standing" if is_static else "while moving"))
     return InertialStart(usable, T_lidar_imu, estimate, offset, agreement.is_judged, is_static, notes, problems)
 
@@ -155,9 +154,7 @@ def _refuse_sign(imu: ImuStream, T_lidar_imu: Floats, part: FirstPoses, gyro_bia
     bias, none = np.zeros(3) if gyro_bias is None else gyro_bias, np.zeros(3)
     guess = ImuEstimate(none, none, none, Gyroscope.of_bias(bias, MEAN_GYRO_BIAS), np.eye(9))
     as_given, reversed_ = (
-        _path_of_force(
-            replace(imu, accel=sign * imu.accel), part.poses @ T_lidar_imu, part.stamps_ns, guess, GRAVITY_S
-        )[2]
+        _path_of_force(replace(imu, accel=sign * imu.accel), part.poses @ T_lidar_imu, part.stamps_ns, guess)[2]
         for sign in (1.0, -1.0)
     )
     # Forces of the right sign miss the path farther nowhere where anything accelerates.
@@ -194,20 +191,12 @@ def _bias_sigma(bias: Floats, device: Gyroscope) -> float:
 def _first_guess(
     imu: ImuStream,
     T_lidar_imu: Floats,
-    stamps_ns: Longs,
-    poses: Floats,
+    part: FirstPoses,
     config: ImuConfig,
     mean_bias: Floats | None,
-) -> tuple[ImuEstimate, bool]:
-    """Initial estimate with its covariance, and whether the sensor is stationary in the first second.
-
-    The gyroscope bias is the configured one, else the mean rate of a stationary sensor, else `mean_bias`. Gravity follows from
-    forces and path.
-    """
-    stands, rates = _is_stationary(imu, stamps_ns, poses)
+) -> ImuEstimate:
+    """Initial estimate with its covariance: the gyroscope bias configured, else `mean_bias`; gravity from forces and path."""
     gyro_bias, gyro_sigma = (np.zeros(3), ANY_GYRO_BIAS) if mean_bias is None else (mean_bias, MEAN_GYRO_BIAS)
-    if stands:
-        gyro_bias, gyro_sigma = rates, STANDING_GYRO_BIAS
     accel_bias, accel_sigma = np.zeros(3), ANY_ACCEL_BIAS
     if config.gyro_bias is not None:
         gyro_bias, gyro_sigma = np.array(config.gyro_bias), MOST_BIAS_ERROR_RAD_S
@@ -220,20 +209,14 @@ def _first_guess(
     covariance[DOWN, BIAS], covariance[BIAS, DOWN] = shared * R, shared * R.T
     gyroscope = Gyroscope.of_bias(gyro_bias, gyro_sigma, ImuNoise.of(config))
     guess = ImuEstimate(np.zeros(3), np.zeros(3), accel_bias, gyroscope, covariance)
-    gravity = _path_of_force(imu, poses @ T_lidar_imu, stamps_ns, guess, GRAVITY_S)[1]
-    return replace(guess, gravity=GRAVITY * gravity / max(float(np.linalg.norm(gravity)), 1e-9)), stands
+    gravity = _path_of_force(imu, part.poses @ T_lidar_imu, part.stamps_ns, guess)[1]
+    return replace(guess, gravity=GRAVITY * gravity / max(float(np.linalg.norm(gravity)), 1e-9))
 
 
-def _is_stationary(imu: ImuStream, stamps_ns: Longs, poses: Floats) -> tuple[bool, Floats]:
-    """Whether the sensor is stationary in the first second, and the mean rates (3,), rad/s, in it."""
-    end_ns = stamps_ns[0] + 1_000_000_000
-    i, j = (int(k) for k in np.searchsorted(imu.stamps_ns, [stamps_ns[0], end_ns]))
-    within = stamps_ns < end_ns
-    if j - i < 5 or within.sum() < 3:
-        return False, np.zeros(3)
-    moved = _farthest(poses[within])
-    varies = float(np.std(imu.gyro[i:j], axis=0).max()), float(np.std(imu.accel[i:j], axis=0).max())
-    return moved < STILL_M and varies[0] < STILL_RATE and varies[1] < STILL_FORCE, imu.gyro[i:j].mean(axis=0)
+def _is_static(part: FirstPoses) -> bool:
+    """Whether no point at `LEVER_M` moves in the first second, by the poses of its scans."""
+    early = part.poses[part.stamps_ns < part.stamps_ns[0] + 1_000_000_000]
+    return max(apart(part.poses[0], pose, LEVER_M) for pose in early) < STILL_M
 
 
 def _farthest(poses: Floats) -> float:
@@ -265,13 +248,13 @@ def _learn(
 
 
 def _path_of_force(
-    imu: ImuStream, T_world_imu: Floats, stamps_ns: Longs, prior: ImuEstimate, seconds: float
+    imu: ImuStream, T_world_imu: Floats, stamps_ns: Longs, prior: ImuEstimate, seconds: float = np.inf
 ) -> tuple[Floats, Floats, float]:
     """Velocity at the first pose (3,) and gravity (3,) that fit the poses of the first `seconds` best, and the velocity's sigma.
 
     If `prior` has a gravity, that is kept and only the velocity is estimated.
     """
-    count = max(int(np.searchsorted(stamps_ns, stamps_ns[0] + round(1e9 * seconds))), min(4, len(stamps_ns)))
+    count = max(int(np.searchsorted(stamps_ns - stamps_ns[0], 1e9 * seconds)), min(4, len(stamps_ns)))
     has_gravity = bool(prior.gravity.any())
     if count < 4:
         step = prior.over(imu, stamps_ns[0] + np.array([0, 500_000_000]))

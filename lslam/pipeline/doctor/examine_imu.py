@@ -11,11 +11,12 @@ from lslam.core.types.arrays import Floats
 from lslam.core.types.imu import GRAVITY, ImuStream
 from lslam.core.types.sequence import Sequence, no_shared_time
 from lslam.odometry.inertial.imu_cleaning import LEAST_RATE_HZ, gravity_unit, is_slow, mean_forces, rate_of
-from lslam.odometry.inertial.initialise import STILL_FORCE, STILL_RATE
 from lslam.pipeline.doctor import Facts, Finding, Findings
 
 # s of standing: white noise is read off the Allan deviation from the first on, where that has its least from the second.
 _WHITE_S, _STABLE_S = 10.0, 120.0
+# A sensor that stands, with its engine on: spread of rates (rad/s) and forces (m/s2) over a second.
+_STILL_RATE, _STILL_FORCE = 0.02, 0.3
 # The Allan deviation over a time is known to a tenth or so where that fits nine times into the record (IEEE Std 952).
 _FITS = 9
 # m/s2 and rad/s per sqrt(Hz): no device is as quiet, so what is below is a simulated or a silent one.
@@ -73,9 +74,9 @@ def _longest_still(accel: Floats, gyro: Floats, rate: float) -> slice:
         return slice(0, 0)
     parts = [values[: count * width].reshape(count, width, 3) for values in (gyro, accel)]
     calm = np.ones(count, bool)
-    for part, limit in zip(parts, (STILL_RATE, STILL_FORCE), strict=True):
+    for part, limit in zip(parts, (_STILL_RATE, _STILL_FORCE), strict=True):
         calm &= part.std(axis=1).max(axis=1) < limit
-    for part, limit in zip(parts, (STILL_RATE, STILL_FORCE), strict=True):
+    for part, limit in zip(parts, (_STILL_RATE, _STILL_FORCE), strict=True):
         if calm.any():
             means = part.mean(axis=1)
             calm &= np.abs(means - np.median(means[calm], axis=0)).max(axis=1) < limit
