@@ -34,7 +34,6 @@ Reach = tuple[float, float, float, bool]
 LEAST_SINE = 0.1
 # Largest variance, rad2, of a normal of three points that counts as observing a direction: four degrees.
 NORMAL_VARIANCE_RAD2 = 5e-3
-SHORTEST_M = 1e-3  # m, of a line or a side of a triangle
 
 
 @inline
@@ -123,7 +122,7 @@ def linearise_edges(
             continue
         ux, uy, uz = edges[k, 0] - p[0], edges[k, 1] - p[1], edges[k, 2] - p[2]
         length = math.sqrt(ux * ux + uy * uy + uz * uz)
-        if length < SHORTEST_M:
+        if length == 0.0:
             continue
         s = 1.0 / length
         ux, uy, uz = ux * s, uy * s, uz * s
@@ -195,7 +194,7 @@ def linearise_planes(
         nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
         area = math.sqrt(nx * nx + ny * ny + nz * nz)
         aa, bb = ax * ax + ay * ay + az * az, bx * bx + by * by + bz * bz
-        if min(aa, bb) < SHORTEST_M * SHORTEST_M or area < LEAST_SINE * math.sqrt(aa * bb):
+        if area <= LEAST_SINE * math.sqrt(aa * bb):
             continue
         s = 1.0 / area
         nx, ny, nz = nx * s, ny * s, nz * s
