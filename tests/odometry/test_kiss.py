@@ -126,7 +126,7 @@ def test_an_empty_scan_is_bridged_and_the_next_one_registered() -> None:
     prior = MotionPrior.at_once(np.diag([1.0, 1.0, 1.0, 1.0]))
     result = method.register(empty, method.prepare(empty), prior)
     assert result.status == "bridged"
-    assert result.reason == "0 usable points, 30 needed"
+    assert result.reason == "0 usable points, 60 needed"
     np.testing.assert_array_equal(result.T_world_lidar, prior.pose)
     assert method.register(scans[5], method.prepare(scans[5]), PRIOR).status == "ok"
 
@@ -176,4 +176,4 @@ def test_points_beyond_its_range_are_no_registration() -> None:
     far = replace(scans[5], points=scans[5].points * np.float32(1e3))
     result = method.register(far, method.prepare(far), PRIOR)
     assert (result.status, result.converged) == ("bridged", False)
-    assert "usable points, 30 needed" in result.reason
+    assert "usable points, 60 needed" in result.reason
