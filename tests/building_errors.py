@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lslam.core.arrays import Floats
 from lslam.core.geometry import geodesy, se2
-from lslam.core.types.arrays import Floats
 from lslam.core.types.building import Building, BuildingCorrection, BuildingStatus, CorrectedMap
 from lslam.simulation.osm_extract import Perturbation, join_outlines, perturb, simplify_outlines
 

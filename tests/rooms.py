@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from lslam.core.arrays import Floats, Longs
 from lslam.core.geometry import se3, so3
-from lslam.core.types.arrays import Floats, Longs
 
 
 def in_room(poses: Floats, of_a_scan: int, rng: np.random.Generator, noise: float = 0.005) -> tuple[Floats, Longs]:

@@ -16,10 +16,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from lslam.core.arrays import Floats
 from lslam.core.config.backend import DebugConfig
 from lslam.core.errors import InputError
 from lslam.core.geometry import noise, se3, so3
-from lslam.core.types.arrays import Floats
 from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.trajectory import Keyframe
 from lslam.evaluation.associate import associate

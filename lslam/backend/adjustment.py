@@ -14,9 +14,9 @@ import numpy as np
 
 from lslam.backend.graph.marginals import PosePrior
 from lslam.backend.kernels import plane_adjustment
+from lslam.core.arrays import Bools, Floats, Longs
 from lslam.core.geometry import noise, se3, so3
 from lslam.core.stopping import checking
-from lslam.core.types.arrays import Bools, Floats, Longs
 
 # m, edges of voxels: what is no plane in one is looked at in the next.
 EDGES_M = (2.0, 1.0, 0.5)

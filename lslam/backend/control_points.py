@@ -15,13 +15,13 @@ from lslam.backend.graph.odometry_constraints import odometry_constraints
 from lslam.backend.graph.pose_graph import Drift, apply_manual, judge_loops
 from lslam.backend.graph.problem import PoseGraph, PositionFix
 from lslam.backend.manual import stamp_of
+from lslam.core.arrays import Floats
 from lslam.core.config import Config
 from lslam.core.errors import GraphError, UsageError
 from lslam.core.geometry import geodesy, noise, se3, so3
 from lslam.core.geometry.noise import quantile
 from lslam.core.geometry.se3 import poses_at
 from lslam.core.printable import count_of
-from lslam.core.types.arrays import Floats
 from lslam.core.types.constraint import Constraint, ControlPoint, ControlResidual, KnownPair, LoopCandidate
 from lslam.core.types.gnss import Georeference
 from lslam.core.types.scan_result import ScanResult

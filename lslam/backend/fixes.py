@@ -22,10 +22,10 @@ from lslam.backend.graph.fix_errors import (
     height_levels,
     rough_residuals,
 )
+from lslam.core.arrays import Bools, Floats, Longs
 from lslam.core.geometry import se3, so3
 from lslam.core.geometry.noise import quantile
 from lslam.core.geometry.se3 import poses_at, turns_between
-from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.core.types.gnss import GnssStream
 
 # Fixes that heights alone reject, at least, as a share of all.

@@ -22,13 +22,13 @@ from lslam.backend.fixes import (
 from lslam.backend.graph.drift import chains, drift_covariance
 from lslam.backend.graph.fix_noise import DriftOfFixes, GaussMarkovNoise, fit_gauss_markov
 from lslam.backend.graph.problem import PoseGraph, PositionFix
+from lslam.core.arrays import Floats
 from lslam.core.config.backend import GnssConfig, GraphConfig
 from lslam.core.config.config import Config
 from lslam.core.errors import InputError
 from lslam.core.geometry import geodesy, noise, se3, so3
 from lslam.core.geometry.noise import RIGHT_PROBABILITY, quantile
 from lslam.core.geometry.se3 import poses_at
-from lslam.core.types.arrays import Floats
 from lslam.core.types.gnss import Georeference, GnssStream
 from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.sequence import Sequence

@@ -15,12 +15,12 @@ import numpy as np
 
 from lslam.backend.graph.problem import FloorPlane, UpDirection
 from lslam.backend.keyframes.store import KeyframeStore
+from lslam.core.arrays import Floats
 from lslam.core.config import Config
 from lslam.core.config.backend import GraphConfig
 from lslam.core.errors import InputError
 from lslam.core.geometry import se3, so3
 from lslam.core.stopping import checking
-from lslam.core.types.arrays import Floats
 from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.sequence import Sequence
 from lslam.core.types.trajectory import Keyframe

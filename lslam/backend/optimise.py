@@ -39,12 +39,12 @@ from lslam.backend.graph.problem import PoseGraph
 from lslam.backend.keyframes.store import KeyframeStore
 from lslam.backend.levelling import floor_planes, on_one_plane, up_directions, world_up
 from lslam.backend.outcome import BackEnd, BackEndInput, keep_odometry, solve, without_steady_drift
+from lslam.core.arrays import Floats
 from lslam.core.config import Config
 from lslam.core.errors import GraphError
 from lslam.core.geometry import geodesy, se3
 from lslam.core.geometry.noise import RIGHT_PROBABILITY, quantile
 from lslam.core.stopping import checking
-from lslam.core.types.arrays import Floats
 from lslam.core.types.constraint import ControlPoint, LoopCandidate, Turn
 from lslam.core.types.gnss import Georeference
 from lslam.core.types.imu import InertialChain

@@ -18,10 +18,10 @@ from lslam.backend.graph.odometry_constraints import correct_scans
 from lslam.backend.graph.pose_graph import optimise
 from lslam.backend.graph.problem import EstimatedDrift, PoseGraph, Solution
 from lslam.backend.keyframes.store import KeyframeStore
+from lslam.core.arrays import Floats
 from lslam.core.config import Config
 from lslam.core.errors import GraphError
 from lslam.core.geometry import se3
-from lslam.core.types.arrays import Floats
 from lslam.core.types.building import CorrectedMap, OsmMatches
 from lslam.core.types.constraint import Constraint, ControlPoint, ControlResidual, LoopCandidate, LoopStage, Verdict
 from lslam.core.types.gnss import Georeference

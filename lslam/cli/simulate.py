@@ -11,7 +11,7 @@ import click
 from lslam.cli import console, options
 
 if TYPE_CHECKING:
-    from lslam.core.types.arrays import Floats
+    from lslam.core.arrays import Floats
     from lslam.simulation.city import City
     from lslam.simulation.scenarios import SimulatedDrive
     from lslam.simulation.scene_mesh import RayScene

@@ -6,11 +6,11 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from lslam.core.arrays import Floats
 from lslam.core.config.outputs import EvalConfig
 from lslam.core.errors import UsageError, nearest
 from lslam.core.geometry import se3, so3
 from lslam.core.printable import metres, significant, with_decimals
-from lslam.core.types.arrays import Floats
 from lslam.core.types.comparison import Metric, Table
 from lslam.evaluation import ALIGNMENTS
 from lslam.evaluation.metric import (

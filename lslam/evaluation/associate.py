@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats, Longs, Stamps
 from lslam.core.errors import InputError
 from lslam.core.geometry import se3, so3
-from lslam.core.types.arrays import Floats, Longs, Stamps
 from lslam.core.types.trajectory import Trajectory
 
 LEAST_POSES = 3

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lslam.core.types.arrays import Bools, Floats
+from lslam.core.arrays import Bools, Floats
 from lslam.core.types.study import Curve, Divergence, Interval, Law, LawKind, Optimum, StudyRow, Value
 
 # Everything else is registration: what Girolimetto's times per iteration hold (equation 5.2).

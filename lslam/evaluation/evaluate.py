@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from lslam.core.arrays import Floats
 from lslam.core.config.outputs import EvalConfig
 from lslam.core.errors import InputError
 from lslam.core.geometry import se3, so3
 from lslam.core.printable import metres
-from lslam.core.types.arrays import Floats
 from lslam.core.types.sequence import LIDAR_FRAME, Calibration
 from lslam.core.types.trajectory import Trajectory
 from lslam.evaluation.absolute import AbsoluteTrajectoryError, absolute_error

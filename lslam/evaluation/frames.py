@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats
 from lslam.core.geometry import se3, so3
-from lslam.core.types.arrays import Floats
 
 # Camera axes (x right, y down, z forward) to body axes (x forward, y left, z up): signed ones, so turning is exact.
 R_BODY_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])

@@ -8,9 +8,9 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats
 from lslam.core.config.outputs import EvalConfig
 from lslam.core.printable import count_of, significant
-from lslam.core.types.arrays import Floats
 from lslam.core.types.comparison import Metric, Table
 from lslam.evaluation.metric import NO_ROTATIONS, Document, Evaluation, MatchedPoses, MetricRow, TrajectoryMetric
 

@@ -10,9 +10,9 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats, Longs
 from lslam.core.config.outputs import EvalConfig
 from lslam.core.printable import significant
-from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.comparison import Metric, Table
 from lslam.evaluation import ALIGNMENTS
 

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats, Longs
 from lslam.core.config.outputs import EvalConfig
 from lslam.core.geometry import se3, so3
 from lslam.core.printable import metres
-from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.comparison import Metric, Table
 from lslam.evaluation import parse_delta
 from lslam.evaluation.metric import (

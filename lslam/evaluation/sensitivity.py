@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
+from lslam.core.arrays import Bools, Floats
 from lslam.core.config.study import ExpectedFinding
-from lslam.core.types.arrays import Bools, Floats
 from lslam.core.types.study import (
     Curve,
     CurveResult,

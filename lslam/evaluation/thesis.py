@@ -12,10 +12,10 @@ from typing import Any, Literal
 
 import numpy as np
 
+from lslam.core.arrays import Floats
 from lslam.core.config.outputs import EvalConfig
 from lslam.core.geometry import so3
 from lslam.core.printable import metres, significant, with_decimals
-from lslam.core.types.arrays import Floats
 from lslam.core.types.comparison import Metric, Table
 from lslam.evaluation.absolute import align
 from lslam.evaluation.metric import (

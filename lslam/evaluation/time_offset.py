@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Bools, Floats, Stamps
 from lslam.core.geometry import se3, so3
-from lslam.core.types.arrays import Bools, Floats, Stamps
 from lslam.core.types.trajectory import Trajectory
 
 # Windows that are compared, s; how far an offset may lie from the one that is begun with, s; rounds of the fit.

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from lslam.core.arrays import Floats, Longs
 from lslam.core.errors import InputError, input_errors
-from lslam.core.types.arrays import Floats, Longs
 from lslam.io.remote import as_path
 
 IMU_SAVING = "saved_s"

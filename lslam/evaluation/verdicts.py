@@ -8,8 +8,8 @@ from typing import Literal
 
 import numpy as np
 
+from lslam.core.arrays import Bools, Floats
 from lslam.core.config.study import ExpectedFinding
-from lslam.core.types.arrays import Bools, Floats
 from lslam.core.types.study import Curve, CurveResult, Judged, Law, Optimum, Outcome
 from lslam.evaluation.curves import (
     FEWEST,

@@ -9,9 +9,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Bools, Floats, Longs
 from lslam.core.errors import ConfigError
 from lslam.core.stopping import check_stop
-from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.maps.occupancy import MODEL, Evidence
 
 Keys = NDArray[np.int64]

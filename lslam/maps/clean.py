@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Bools, Floats, Longs
 from lslam.core.geometry import se3, so3
 from lslam.core.stopping import checking
-from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.core.types.state import State
 from lslam.maps.observations import Observations
 from lslam.registration.preprocessing.ground import Z

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Bools, Floats, Ints, Longs
 from lslam.core.errors import output_errors
 from lslam.core.geometry import portable
 from lslam.core.stopping import checking
-from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.core.types.camera import Image, Lens
 from lslam.core.types.cloud import BLOCK, ArrayCloud, Cloud, CloudBlock
 
@@ -213,7 +213,7 @@ def warm_up() -> None:
     colourer.result()
 
 
-def image_gains(views: NDArray[np.int32], colours: NDArray[np.uint8], is_view: Bools, images: int) -> Floats:
+def image_gains(views: Ints, colours: NDArray[np.uint8], is_view: Bools, images: int) -> Floats:
     """Gains (V, 3) of `images` images, about 1: the value of a pixel is the gain times the colour of its point.
 
     views, is_view : (N, K) the images that show each point, and where there is one; colours : (N, K, 3)
@@ -235,7 +235,7 @@ def image_gains(views: NDArray[np.int32], colours: NDArray[np.uint8], is_view: B
     return gains
 
 
-def _log_gains(point: NDArray[np.intp], view: NDArray[np.int32], logs: Floats, images: int) -> Floats:
+def _log_gains(point: NDArray[np.intp], view: Ints, logs: Floats, images: int) -> Floats:
     """Logarithms of the gains (V,) from the logarithm of each observation (M,), by its point and its view."""
     from scipy import sparse
     from scipy.sparse.linalg import spsolve

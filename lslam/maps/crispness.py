@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from lslam.core.arrays import Floats
 from lslam.core.errors import InputError, UsageError
-from lslam.core.types.arrays import Floats
 from lslam.core.types.cloud import ArrayCloud, Cloud, in_memory
 from lslam.core.types.run_record import Crispness, MapDifference
 from lslam.maps.merge import MergedMap

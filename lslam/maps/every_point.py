@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats
 from lslam.core.errors import InputError, OutputError, cause, output_errors
 from lslam.core.geometry import se3
 from lslam.core.stopping import checking
-from lslam.core.types.arrays import Floats
 from lslam.core.types.cloud import BLOCK, CloudBlock
 from lslam.core.types.scan import has_return
 from lslam.core.types.state import State

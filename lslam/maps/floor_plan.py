@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.core.types.arrays import Floats
+from lslam.core.arrays import Floats
 from lslam.core.types.cloud import ArrayCloud, Cloud
 from lslam.maps.occupancy import OccupancyGrid
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats
 from lslam.core.errors import UsageError
 from lslam.core.geometry import se3, so3
 from lslam.core.geometry.geodesy import (
@@ -23,7 +24,6 @@ from lslam.core.geometry.geodesy import (
     local_crs,
     to_local,
 )
-from lslam.core.types.arrays import Floats
 from lslam.core.types.cloud import Cloud, CloudBlock
 from lslam.core.types.gnss import Georeference, OutputCrs
 

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats, Longs
 from lslam.core.errors import ConfigError, InputError
 from lslam.core.stopping import checking
-from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.cloud import BLOCK, CloudBlock, in_memory
 from lslam.core.types.state import State
 from lslam.maps.observations import TAGS, Observations, column_types, columns_of, tags_of

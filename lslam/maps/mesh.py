@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats, Ints
 from lslam.core.errors import InputError
 from lslam.core.extras import importing_open3d
-from lslam.core.types.arrays import Floats
 from lslam.core.types.cloud import ArrayCloud
 
 NEIGHBOURS, DEVIATIONS = 20, 2.0
@@ -24,7 +24,7 @@ class Mesh:
     """A surface: vertices (V, 3) float64, m; triangles (F, 3) int32, counter-clockwise seen from where the sensor was."""
 
     vertices: Floats
-    triangles: NDArray[np.int32]
+    triangles: Ints
 
 
 def require_open3d() -> Any:

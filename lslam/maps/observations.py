@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.core.types.arrays import Longs
+from lslam.core.arrays import Longs
 from lslam.core.types.cloud import TIME_NS
 from lslam.core.types.scan import NO_RING, Scan
 

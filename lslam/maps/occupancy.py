@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Bools, Floats, Ints, Longs
 from lslam.core.errors import ConfigError
-from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.core.types.state import State
 from lslam.maps.sorted_runs import KeyedRows, StoredRows
 
@@ -27,7 +27,7 @@ class OccupancyGrid:
     cells : (M, 3) int32, cell i covers [i, i + 1) * voxel of the world, m; log_odds : (M,) int16, hundredths
     """
 
-    cells: NDArray[np.int32]
+    cells: Ints
     log_odds: NDArray[np.int16]
     voxel: float
 

@@ -13,8 +13,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats
 from lslam.core.errors import output_errors
-from lslam.core.types.arrays import Floats
 from lslam.core.types.cloud import BLOCK, Cloud, CloudBlock, bounds
 
 # Cells of a node along each axis; points of a node that is not divided; points that are held in memory; levels, at most.

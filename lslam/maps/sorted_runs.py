@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Ints, Longs
 from lslam.core.errors import InputError, OutputError, cause, output_errors
 from lslam.core.stopping import checking
-from lslam.core.types.arrays import Longs
 from lslam.core.types.state import State
 
 Rows = NDArray[np.int64]
@@ -169,7 +169,7 @@ class KeyedRows:
         self._places = beside, folder
         self._runs: SortedRuns | None = None
         self.rows: Rows = np.empty((0, columns), np.int64)
-        self.slots: NDArray[np.int32] = np.empty(0, np.int32)
+        self.slots: Ints = np.empty(0, np.int32)
         self.used = 0
         self.reserve(room)
 

@@ -14,10 +14,10 @@ from itertools import pairwise
 
 import numpy as np
 
+from lslam.core.arrays import Floats
 from lslam.core.geometry import se3, so3
 from lslam.core.kernels import linearisation as at
 from lslam.core.kernels.gauss_newton import UNSEEN_SHARE
-from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.registration.alignment import voxel_terms
 from lslam.registration.gaussian_map import GaussianMap

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from lslam.core.arrays import Floats
 from lslam.core.config.config import Config
 from lslam.core.config.odometry import rest_alone
-from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.odometry.base import MapMethod
 from lslam.odometry.icp import Icp, registration_of

@@ -12,9 +12,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats, Ints, Longs
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.kernels import voxel
-from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.state import State, Stateful
 from lslam.odometry.kernels.feature_grid import Matches, build
 from lslam.odometry.kernels.feature_residuals import add_normals
@@ -23,7 +23,7 @@ from lslam.registration.local_map import LastKeyframes, LocalMap
 from lslam.registration.preprocessing.features import FeaturePoints, Features
 from lslam.registration.preprocessing.prepare import NO_TIMES
 
-Grid = tuple[Floats, NDArray[np.uint16], NDArray[np.int32], Longs, NDArray[np.int32]]
+Grid = tuple[Floats, NDArray[np.uint16], Ints, Longs, Ints]
 
 # m, how far a counterpart may lie: the rings of sixteen beams are that far apart on the ground at 10 m.
 MATCH_REACH_M = 2.0

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from lslam.core.arrays import Floats
 from lslam.core.config.odometry import RecoveryConfig, RegistrationConfig
-from lslam.core.types.arrays import Floats
 from lslam.core.types.state import Stateful
 from lslam.odometry.feature_map import MIN_LINE_POINTS
 from lslam.odometry.feature_solver import remap_solution

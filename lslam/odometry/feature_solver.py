@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lslam.core.arrays import Floats
 from lslam.core.geometry import se3, so3
-from lslam.core.types.arrays import Floats
 from lslam.core.types.scan_result import StageClock
 from lslam.odometry.feature_map import MIN_LINE_POINTS, FeatureMap, FeatureScan
 from lslam.odometry.kernels.feature_residuals import linearise_edges, linearise_planes

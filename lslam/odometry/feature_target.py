@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats
 from lslam.core.config.config import Config
 from lslam.core.geometry import se3
-from lslam.core.types.arrays import Floats
 from lslam.odometry.feature_map import (
     FeatureKeyframes,
     FeatureMap,

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from lslam.core.arrays import Floats
 from lslam.core.errors import InputError, UsageError
 from lslam.core.geometry.se3 import poses_at
-from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan, Span
 from lslam.core.types.scan_result import ScanResult

@@ -6,10 +6,10 @@ import time
 from dataclasses import replace
 from typing import Any, ClassVar
 
+from lslam.core.arrays import Floats
 from lslam.core.config.config import Config
 from lslam.core.config.odometry import RecoveryConfig
 from lslam.core.errors import UsageError
-from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
 from lslam.odometry.base import MapMethod

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from lslam.core.arrays import Floats
 from lslam.core.config.config import Config
 from lslam.core.config.odometry import rest_alone
-from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan_result import ScanEquations
 from lslam.odometry.fast_lio import FastLio2

@@ -8,11 +8,11 @@ from typing import ClassVar
 
 import numpy as np
 
+from lslam.core.arrays import Floats, Longs
 from lslam.core.config.config import Config
 from lslam.core.errors import UsageError
 from lslam.core.geometry import noise, se3
 from lslam.core.kernels.transform import transform
-from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.imu import MotionState, PreintegratedStep, SweepLink
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import LEVER_M, Scan, Span

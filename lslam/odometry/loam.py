@@ -7,8 +7,8 @@ from functools import cached_property
 
 import numpy as np
 
+from lslam.core.arrays import Floats
 from lslam.core.config.config import Config
-from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import StageClock

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from lslam.core.arrays import Floats
 from lslam.core.config.config import Config
 from lslam.core.geometry import se3
-from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import StageClock

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lslam.core.arrays import Bools, Floats, Longs
 from lslam.core.geometry import se3, so3
-from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.core.types.imu import MotionState, PreintegratedStep
 from lslam.odometry.inertial.filter import Normal
 from lslam.odometry.plane_segmentation import linearise_view

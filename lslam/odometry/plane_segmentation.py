@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Bools, Floats, Longs
 from lslam.core.geometry import so3
 from lslam.core.kernels import gaussians
 from lslam.core.kernels.voxel import MASK, OFFSET
-from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.local_map import LEAST_BREADTH
 

@@ -9,9 +9,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from lslam.core.arrays import Bools, Floats, Longs
 from lslam.core.geometry import se3
 from lslam.core.kernels import linalg
-from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.core.types.imu import MotionState, PreintegratedStep
 from lslam.odometry.inertial.filter import Normal
 from lslam.odometry.plane_factors import (

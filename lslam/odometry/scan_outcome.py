@@ -9,10 +9,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from lslam.core.arrays import Floats
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.geometry import se3, so3
 from lslam.core.kernels import voxel
-from lslam.core.types.arrays import Floats
 from lslam.core.types.scan import FARTHEST_M, Scan
 from lslam.core.types.scan_result import FASTEST_M_S, FASTEST_RAD_S, ScanResult
 from lslam.registration.acceptance import Acceptance, failure

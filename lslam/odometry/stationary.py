@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from lslam.core.arrays import Floats
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.geometry import se3, so3
-from lslam.core.types.arrays import Floats
 from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.state import Stateful

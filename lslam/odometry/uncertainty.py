@@ -15,8 +15,8 @@ from typing import ClassVar
 
 import numpy as np
 
+from lslam.core.arrays import Floats
 from lslam.core.geometry import noise, se3
-from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.state import Stateful
 from lslam.odometry.inertial.constant_velocity import USUAL_ACCELERATION

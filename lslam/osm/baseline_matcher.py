@@ -16,12 +16,12 @@ from lslam.backend.graph.odometry_constraints import fitness_covariance
 from lslam.backend.graph.problem import PoseGraph, Solution
 from lslam.backend.keyframes.store import KeyframeStore, submap_labels
 from lslam.backend.outcome import BackEndInput
+from lslam.core.arrays import Floats
 from lslam.core.config import Config
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.geometry import se2, se3
 from lslam.core.labels import table_of
 from lslam.core.stopping import checking
-from lslam.core.types.arrays import Floats
 from lslam.core.types.building import BuildingMatch, KeyframeMatch, OsmMatches
 from lslam.core.types.scan_result import StageClock
 from lslam.io.formats.osm_buildings import BuildingExtract

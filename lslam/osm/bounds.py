@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats
 from lslam.core.errors import InputError, UsageError
 from lslam.core.geometry.geodesy import from_local
-from lslam.core.types.arrays import Floats
 from lslam.io.formats.geojson import read_line
 from lslam.io.formats.stamped_csv import read_gnss_csv
 from lslam.io.formats.trajectory_files import read_trajectory

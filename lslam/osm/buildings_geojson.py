@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from lslam.core.arrays import Floats
 from lslam.core.errors import InputError, cause
 from lslam.core.geometry import se2
 from lslam.core.geometry.geodesy import from_local, to_local
-from lslam.core.types.arrays import Floats
 from lslam.core.types.building import Building, BuildingCorrection, CorrectedMap, Footprint, about
 from lslam.core.untrusted import MISFIT, parse_json
 from lslam.io.formats.atomic import write_text

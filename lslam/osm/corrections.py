@@ -24,11 +24,11 @@ from lslam.backend.graph.building_graph import (
 from lslam.backend.graph.drift import with_drift
 from lslam.backend.graph.problem import PoseGraph, Solution
 from lslam.backend.outcome import BackEndInput
+from lslam.core.arrays import Bools, Floats
 from lslam.core.config import Config
 from lslam.core.config.backend import OsmConfig
 from lslam.core.geometry import se2
 from lslam.core.stopping import checking
-from lslam.core.types.arrays import Bools, Floats
 from lslam.core.types.building import (
     Building,
     BuildingCorrection,

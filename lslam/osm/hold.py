@@ -12,12 +12,12 @@ from lslam.backend.graph.odometry_constraints import correct_scans
 from lslam.backend.graph.problem import PlanarPrior, PoseGraph
 from lslam.backend.keyframes.store import KeyframeStore
 from lslam.backend.outcome import BackEnd, BackEndInput, solve
+from lslam.core.arrays import Floats
 from lslam.core.config import Config
 from lslam.core.config.backend import OsmConfig
 from lslam.core.errors import GraphError, InputError
 from lslam.core.geometry import se2, se3
 from lslam.core.stopping import checking
-from lslam.core.types.arrays import Floats
 from lslam.core.types.gnss import Georeference
 from lslam.core.types.scan_result import KeyframeClocks
 from lslam.io.formats.osm_buildings import BuildingExtract

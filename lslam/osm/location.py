@@ -16,13 +16,13 @@ import numpy as np
 from lslam.backend.graph.problem import PlanarPrior, Solution
 from lslam.backend.keyframes.store import KeyframeStore, neighbours, submap, submap_labels
 from lslam.backend.levelling import floor_planes
+from lslam.core.arrays import Floats
 from lslam.core.config import Config
 from lslam.core.config.backend import GraphConfig, OsmConfig
 from lslam.core.geometry import se2, se3, so3
 from lslam.core.geometry.noise import RIGHT_PROBABILITY, quantile
 from lslam.core.labels import table_of
 from lslam.core.stopping import checking
-from lslam.core.types.arrays import Floats
 from lslam.core.types.building import BuildingMatch, KeyframeMatch, OsmMatches
 from lslam.core.types.constraint import Verdict
 from lslam.core.types.scan_result import KeyframeClocks

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from lslam.core.arrays import Floats, Longs
 from lslam.core.stopping import checking
-from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.building import Building, about, footprint_polygon, is_canopy
 
 TOUCHING_M = 0.05  # m; walls of neighbours at most this far apart on the map are a party wall

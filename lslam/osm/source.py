@@ -17,12 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.backend.georeferencing import require_crs
+from lslam.core.arrays import Floats, Longs
 from lslam.core.config import Config
 from lslam.core.config.backend import OsmConfig
 from lslam.core.errors import InputError, LslamError, UsageError, input_errors
 from lslam.core.geometry import se2
 from lslam.core.geometry.geodesy import from_local, to_local
-from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.gnss import GnssStream
 from lslam.core.types.sequence import Sequence
 from lslam.core.untrusted import MISFIT

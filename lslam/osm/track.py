@@ -9,8 +9,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from lslam.core.arrays import Floats
 from lslam.core.geometry import se2
-from lslam.core.types.arrays import Floats
 from lslam.core.types.building import KeyframeMatch
 
 # m, correlation length of odometry's drift.

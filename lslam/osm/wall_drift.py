@@ -17,10 +17,10 @@ import numpy as np
 from lslam.backend.graph.drift import MEMORY_M, SIZES, correct_drift, linear_basis, mean_rates, rate_roots, walk_root
 from lslam.backend.graph.factors import PLANAR
 from lslam.backend.graph.problem import EstimatedDrift, PoseGraph
+from lslam.core.arrays import Floats, Longs
 from lslam.core.config.backend import GraphConfig
 from lslam.core.geometry.noise import RIGHT_PROBABILITY, quantile
 from lslam.core.stopping import checking
-from lslam.core.types.arrays import Floats, Longs
 
 # Degrees of freedom of the residuals (Student's t), against walls matched wrongly.
 FREEDOM = 3.0

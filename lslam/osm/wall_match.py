@@ -14,9 +14,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats, Longs
 from lslam.core.config.backend import OsmConfig
 from lslam.core.geometry import se2
-from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.building import BuildingMatch, KeyframeMatch
 from lslam.core.types.constraint import Verdict
 from lslam.osm.kernels import wall_matching

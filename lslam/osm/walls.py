@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Bools, Floats, Longs
 from lslam.core.config.backend import OsmConfig
 from lslam.core.kernels import ground
 from lslam.core.labels import CLASSES
-from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.core.types.building import (
     Building,
     BuildingMatch,

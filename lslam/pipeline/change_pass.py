@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from lslam.core import __version__
+from lslam.core.arrays import Floats
 from lslam.core.errors import OutputExistsError, UsageError, output_errors
 from lslam.core.geometry import se3
 from lslam.core.geometry.geodesy import frame_change
 from lslam.core.stopping import asking
-from lslam.core.types.arrays import Floats
 from lslam.core.types.gnss import Georeference
 from lslam.core.types.sequence import Sequence
 from lslam.io.formats.geojson import write_areas

@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats
 from lslam.core.config import Config
 from lslam.core.errors import InputError, LslamError
 from lslam.core.geometry import portable, se3
 from lslam.core.geometry.se3 import ContinuousMotion
 from lslam.core.stopping import asking
-from lslam.core.types.arrays import Floats
 from lslam.core.types.camera import Camera, cameras_of
 from lslam.core.types.cloud import Cloud, thin_out
 from lslam.core.types.run_record import FeatureView

@@ -16,12 +16,12 @@ from lslam.backend.graph.odometry_constraints import correct_scans
 from lslam.backend.keyframes.store import KeyframeStore
 from lslam.backend.localization.locate import MapFollower, PlaceFinder, Start, StartPrior, mark_doubts
 from lslam.backend.localization.prior_map import LocalView, PlaceSearch, PriorMap
+from lslam.core.arrays import Bools, Floats
 from lslam.core.config import Config
 from lslam.core.errors import InterruptedRunError, RunFailedError
 from lslam.core.geometry import noise, se3
 from lslam.core.geometry.geodesy import to_local
 from lslam.core.stopping import asking
-from lslam.core.types.arrays import Bools, Floats
 from lslam.core.types.cloud import ArrayCloud, thin_out
 from lslam.core.types.constraint import MapFix
 from lslam.core.types.run_record import RunRecord

@@ -13,12 +13,12 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
+from lslam.core.arrays import Floats
 from lslam.core.config import Config
 from lslam.core.config.outputs import MapConfig
 from lslam.core.errors import InputError, InterruptedRunError
 from lslam.core.geometry.se3 import poses_at
 from lslam.core.stopping import asking
-from lslam.core.types.arrays import Floats
 from lslam.core.types.cloud import Cloud, in_memory, thin_out
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import NO_RING, Scan

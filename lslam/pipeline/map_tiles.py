@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.backend.localization.prior_map import PriorMap, make_prior_map
+from lslam.core.arrays import Floats
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.errors import (
     ConfigError,
@@ -25,7 +26,6 @@ from lslam.core.errors import (
     UsageError,
     output_errors,
 )
-from lslam.core.types.arrays import Floats
 from lslam.core.types.cloud import TIME_NS, ArrayCloud, Cloud
 from lslam.core.types.gnss import Georeference, OutputCrs
 from lslam.core.types.sequence import Sequence

@@ -18,10 +18,10 @@ from lslam.backend.localization.sessions import Chain, Session, tie
 from lslam.backend.loops.detector import Detector
 from lslam.backend.loops.find_loops import warm_up
 from lslam.backend.outcome import apply_verdicts
+from lslam.core.arrays import Floats
 from lslam.core.config import Config
 from lslam.core.errors import GraphError, InputError, InterruptedRunError, RunFailedError, UsageError
 from lslam.core.stopping import asking
-from lslam.core.types.arrays import Floats
 from lslam.core.types.constraint import LoopCandidate
 from lslam.core.types.scan_result import ScanResult
 from lslam.core.untrusted import MISFIT

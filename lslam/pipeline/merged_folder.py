@@ -13,10 +13,10 @@ import numpy as np
 from lslam.backend.graph.factors import regularise
 from lslam.backend.localization.sessions import Session
 from lslam.core import __version__
+from lslam.core.arrays import Floats
 from lslam.core.config import Config
 from lslam.core.errors import InputError, InterruptedRunError, LslamError, UsageError
 from lslam.core.geometry import se3
-from lslam.core.types.arrays import Floats
 from lslam.core.types.gnss import Georeference
 from lslam.core.types.sequence import Sequence as Recording
 from lslam.core.types.trajectory import Trajectory

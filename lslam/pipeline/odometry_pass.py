@@ -9,11 +9,11 @@ from itertools import pairwise
 import numpy as np
 
 from lslam.backend.keyframes.store import KeyframeStore
+from lslam.core.arrays import Floats
 from lslam.core.config import Config
 from lslam.core.errors import InputError
 from lslam.core.kernels import jit
 from lslam.core.machine import rarely_collecting
-from lslam.core.types.arrays import Floats
 from lslam.core.types.constraint import Turn
 from lslam.core.types.imu import InertialChain
 from lslam.core.types.run_record import RunRecord

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from lslam.core import __version__
+from lslam.core.arrays import Floats
 from lslam.core.config import Config, to_toml
 from lslam.core.config.outputs import MapConfig
 from lslam.core.geometry import se3
-from lslam.core.types.arrays import Floats
 from lslam.core.types.building import BuildingMatch, KeyframeMatch, OsmMatches
 from lslam.core.types.constraint import LoopCandidate
 from lslam.core.types.imu import IMU_STATES

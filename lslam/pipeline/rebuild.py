@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from lslam.core.arrays import Floats
 from lslam.core.config import Config, load_config
 from lslam.core.errors import (
     InputError,
@@ -24,7 +25,6 @@ from lslam.core.errors import (
     cause,
     output_errors,
 )
-from lslam.core.types.arrays import Floats
 from lslam.core.types.gnss import Georeference, OutputCrs
 from lslam.core.types.run_record import Crispness, RunRecord
 from lslam.core.types.scan_result import ScanResult, Status

@@ -11,11 +11,11 @@ import numpy as np
 from lslam.backend.adjustment import NO_NUMBERS, SweptPoints, adjust
 from lslam.backend.graph.marginals import PosePrior
 from lslam.backend.graph.odometry_constraints import bend_scans
+from lslam.core.arrays import Bools, Floats, Longs
 from lslam.core.config import Config
 from lslam.core.errors import InterruptedRunError
 from lslam.core.geometry import se3
 from lslam.core.stopping import asking
-from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.core.types.run_record import RunRecord
 from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import ScanResult

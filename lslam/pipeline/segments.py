@@ -13,9 +13,9 @@ from lslam.backend.keyframes.store import KeyframeStore, PartOfStore
 from lslam.backend.localization.sessions import Chain, Session, Vicinity, tie
 from lslam.backend.loops.detector import LEAST_REACH
 from lslam.backend.loops.verify import is_elsewhere
+from lslam.core.arrays import Floats, Longs
 from lslam.core.config import Config
 from lslam.core.geometry import noise, se3
-from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.scan_result import MOST_ACCELERATION_M_S2, MotionCheck, ScanResult, motion_apart
 from lslam.core.types.trajectory import Keyframe, Segment
 from lslam.odometry.integrity.alerts import LARGE, Alert, alerts, stamp_faults

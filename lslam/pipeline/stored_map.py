@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from lslam.core.arrays import Floats
 from lslam.core.errors import InputError
-from lslam.core.types.arrays import Floats
 from lslam.core.types.cloud import ArrayCloud
 from lslam.core.types.gnss import Georeference
 from lslam.io.formats.point_files import MAP_SUFFIXES, SUFFIXES, MapCloud, read_cloud

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from lslam.core.arrays import Floats
 from lslam.core.stopping import Stop
-from lslam.core.types.arrays import Floats
 from lslam.core.types.cloud import ArrayCloud
 from lslam.core.types.run_record import RunRecord
 from lslam.core.types.trajectory import Trajectory

@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from lslam.core.types.arrays import Floats
+from lslam.core.arrays import Floats
 from lslam.core.types.scan_result import OPEN_M, OPEN_RAD
 from lslam.registration.history import UsualAgreement
 from lslam.registration.result import RegistrationResult

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from lslam.core.arrays import Floats
 from lslam.core.config.odometry import RegistrationConfig
-from lslam.core.types.arrays import Floats
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.kernels import prior_residual
 from lslam.registration.local_map import LocalMap

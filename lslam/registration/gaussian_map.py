@@ -10,9 +10,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats
 from lslam.core.errors import InputError
 from lslam.core.kernels import gaussians
-from lslam.core.types.arrays import Floats
 from lslam.core.types.state import State, Stateful
 from lslam.registration.kernels.discs import EXTENT_M2, source_discs
 

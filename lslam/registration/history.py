@@ -10,10 +10,10 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.kernels.linearisation import OUTLIER_SIGMAS, SIGNIFICANT_SIGMAS
-from lslam.core.types.arrays import Floats
 from lslam.core.types.state import Stateful
 from lslam.registration.optimiser import KERNEL_MIN_M
 from lslam.registration.rest import Rest

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats
 from lslam.core.geometry import se3, so3
-from lslam.core.types.arrays import Floats
 from lslam.registration.local_map import LocalMap, MapScans
 from lslam.registration.preprocessing.prepare import PreparedPoints
 

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.geometry import se3, so3
 from lslam.core.kernels.linearisation import SIGNIFICANT_SIGMAS
-from lslam.core.types.arrays import Floats
 from lslam.core.types.state import State, Stateful
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.preprocessing.prepare import PreparedPoints

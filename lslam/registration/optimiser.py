@@ -10,12 +10,11 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats, Ints, Longs
 from lslam.core.geometry import se3, so3
 from lslam.core.kernels import linearisation as at
 from lslam.core.kernels.gauss_newton import UNSEEN_SHARE, step, step_on_surfaces, trimming_distance2
-from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.scan import LEVER_M
 from lslam.registration.result import RegistrationResult
 
@@ -68,7 +67,7 @@ class Correspondences:
         return *self._looked_up[target], self.is_done, self.away2
 
 
-def slots_of(count: int) -> tuple[Longs, NDArray[np.int32]]:
+def slots_of(count: int) -> tuple[Longs, Ints]:
     """Octant cells and slots of so many points, nothing looked up yet: what is not written is never paged in."""
     return np.full(count, -1, np.int64), np.empty((count, 8), np.int32)
 

@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lslam.core.arrays import Bools, Floats, Points
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.config.odometry import RecoveryConfig, RegistrationConfig
 from lslam.core.geometry import se3, so3
-from lslam.core.types.arrays import Bools, Floats, Points
 from lslam.registration.alignment import solve, upright_directions, voxel_terms
 from lslam.registration.attempt import RECOVER_DEG, RECOVER_M, Attempt, Policy
 from lslam.registration.gaussian_map import GaussianMap

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.config.odometry import RecoveryConfig, RegistrationConfig
 from lslam.core.errors import InputError
 from lslam.core.geometry import se3
-from lslam.core.types.arrays import Floats
 from lslam.core.types.scan_result import StageClock
 from lslam.core.types.state import Stateful
 from lslam.registration.acceptance import failure

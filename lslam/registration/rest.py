@@ -10,11 +10,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Bools, Floats, Longs
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.geometry import se3
 from lslam.core.geometry.noise import RIGHT_PROBABILITY, quantile
 from lslam.core.kernels.linearisation import OUTLIER_SIGMAS
-from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.core.types.state import Stateful
 from lslam.registration.alignment import upright_directions
 from lslam.registration.gaussian_map import FLOOR_M2

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from lslam.core.arrays import Floats
 from lslam.core.kernels import linearisation as at
-from lslam.core.types.arrays import Floats
 from lslam.core.types.imu import MotionState
 from lslam.core.types.motion_prior import MotionPrior
 

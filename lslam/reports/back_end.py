@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats
 from lslam.core.geometry import se3
 from lslam.core.printable import count_of, metres
-from lslam.core.types.arrays import Floats
 from lslam.core.types.cloud import ArrayCloud
 from lslam.core.types.comparison import Table
 from lslam.core.types.constraint import MapFix

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lslam.core.arrays import Floats
 from lslam.core.geometry import se2
 from lslam.core.printable import count_of
-from lslam.core.types.arrays import Floats
 from lslam.core.types.building import Building, BuildingCorrection, CorrectedMap, KeyframeMatch, OsmMatches
 from lslam.core.types.comparison import Table
 from lslam.core.types.run_record import RunRecord

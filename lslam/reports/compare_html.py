@@ -11,9 +11,9 @@ from urllib.parse import quote
 
 import numpy as np
 
+from lslam.core.arrays import Floats, Longs
 from lslam.core.errors import LslamError
 from lslam.core.printable import metres
-from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.cloud import ArrayCloud, thin_out
 from lslam.core.types.comparison import Comparison, Drawing, DrawnRun, RunScore, Table
 from lslam.io.formats.atomic import write_text

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats
 from lslam.core.geometry import se3
 from lslam.core.printable import count_of, metres
-from lslam.core.types.arrays import Floats
 from lslam.core.types.run_record import RunRecord
 from lslam.core.types.scan_result import ScanResult
 from lslam.evaluation.evaluate import shown_metrics

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats
 from lslam.core.errors import InputError, OutputError, UsageError, cause, nearest
 from lslam.core.extras import importing, install_hint
 from lslam.core.geometry import geodesy, se3, so3
-from lslam.core.types.arrays import Floats
 from lslam.core.types.building import CorrectedMap
 from lslam.core.types.cloud import ArrayCloud
 from lslam.core.types.gnss import Georeference

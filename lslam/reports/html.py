@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from lslam.core.arrays import Floats, Longs
 from lslam.core.printable import count_of
-from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.comparison import Table
 from lslam.core.types.imu import XYZ
 from lslam.core.types.run_record import RunRecord

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats, Longs
 from lslam.core.geometry import se3, so3
-from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.cloud import ArrayCloud
 from lslam.core.types.constraint import LoopCandidate, LoopStage
 from lslam.core.types.run_record import FeatureView, PairView, RunRecord

@@ -18,7 +18,7 @@ from lslam.io.formats.atomic import atomic_write
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from lslam.core.types.arrays import Floats
+    from lslam.core.arrays import Floats
     from lslam.evaluation.metric import AbsoluteError, Evaluation
     from lslam.io.formats.osm_buildings import BuildingExtract
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.core.types.arrays import Floats
+from lslam.core.arrays import Floats
 from lslam.io.formats.atomic import atomic_write
 from lslam.reports.picture import COLOURS, house_style, picture
 from lslam.simulation.plan import COARSE, FINE, PATH, ScenePlan

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.core.types.arrays import Floats
+from lslam.core.arrays import Floats
 from lslam.core.types.imu import XYZ
 from lslam.core.types.run_record import RunRecord
 from lslam.reports import svg

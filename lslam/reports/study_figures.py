@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from lslam.core.arrays import Floats
 from lslam.core.config.config import unit_of, with_unit
-from lslam.core.types.arrays import Floats
 from lslam.core.types.study import CurveResult, Law, StudyResult, StudyRow
 from lslam.evaluation.curves import FLAT_SHARE, NOT_REGISTRATION, band, normalise, registration_ms
 from lslam.reports.picture import COLOURS, house_style, label, pictures

@@ -18,7 +18,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.core.types.arrays import Floats
+from lslam.core.arrays import Floats
 
 # What of a scan an abscissa is: its number, distance along ground truth or travelled, s since the first; or both axes of a
 # plane its place in the run's own world or as aligned to ground truth. Empty: nothing of a scan.

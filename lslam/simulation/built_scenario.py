@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats
 from lslam.core.errors import UsageError
-from lslam.core.types.arrays import Floats
 from lslam.simulation.city import City, build_city
 from lslam.simulation.countryside import build_carpark, build_corridor, build_motorway, build_woods
 from lslam.simulation.curve import RouteCurve, Terrain, rolling, stretch

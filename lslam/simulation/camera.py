@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats, Longs
 from lslam.core.geometry import portable, se3
-from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.camera import Camera, Image, Lens
 from lslam.io.formats.atomic import write_text
 from lslam.io.formats.image_files import write_png

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from pydantic import Field, model_validator
 
+from lslam.core.arrays import Floats
 from lslam.core.config.input import Section
 from lslam.core.geometry import portable
-from lslam.core.types.arrays import Floats
 from lslam.simulation import furniture
 from lslam.simulation.curve import RouteCurve, Terrain
 from lslam.simulation.scene_mesh import MeshBuilder, SceneMesh, Surface, grid_faces, grid_vertices

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from lslam.core.arrays import Floats
 from lslam.core.errors import UsageError
 from lslam.core.geometry import portable
-from lslam.core.types.arrays import Floats
 from lslam.simulation import furniture
 from lslam.simulation.city import City, Layout, StreetSite, add_ground, lot
 from lslam.simulation.curve import RouteCurve, Terrain, smooth_curve

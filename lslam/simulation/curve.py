@@ -8,8 +8,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats
 from lslam.core.geometry import portable
-from lslam.core.types.arrays import Floats
 
 DEGREE = 5
 _REACH = 60  # points from one end after which nothing of it is left: an influence falls by 0.43 from knot to knot

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lslam.core.arrays import Floats
 from lslam.core.geometry import portable
-from lslam.core.types.arrays import Floats
 from lslam.simulation.scene_mesh import MeshBuilder, SceneMesh, Surface, grid_faces, tube
 
 Quad = list[tuple[float, float, float]]

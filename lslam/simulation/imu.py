@@ -7,10 +7,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from pydantic import Field
 
+from lslam.core.arrays import Floats, Longs
 from lslam.core.config.input import Section
 from lslam.core.errors import UsageError, nearest
 from lslam.core.geometry import portable, se3, so3
-from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.imu import ImuStream
 from lslam.simulation.kinematics import Kinematics, Motion
 

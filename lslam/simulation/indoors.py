@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from lslam.core.arrays import Floats
 from lslam.core.geometry import portable
-from lslam.core.types.arrays import Floats
 from lslam.simulation.city import City
 from lslam.simulation.curve import RouteCurve, Terrain, rounded_rectangle, smooth_curve
 from lslam.simulation.scene_mesh import MeshBuilder, Surface

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
+from lslam.core.arrays import Floats
 from lslam.core.kernels.jit import kernel
-
-Floats = NDArray[np.float64]
 
 
 @kernel

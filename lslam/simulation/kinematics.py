@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from lslam.core.arrays import Floats
 from lslam.core.config.input import Section
 from lslam.core.geometry import portable, se3, so3
-from lslam.core.types.arrays import Floats
 from lslam.simulation.curve import interpolating_spline
 
 KNOT_STEP_S = 0.02  # s between the knots: scans at 10 Hz fall on knots, where the spline meets the path exactly

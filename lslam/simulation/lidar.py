@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Bools, Floats
 from lslam.core.geometry import portable
 from lslam.core.labels import CLASSES
-from lslam.core.types.arrays import Bools, Floats
 from lslam.core.types.scan import Scan
 from lslam.simulation.lidar_models import LidarModel
 from lslam.simulation.returns import Errors, Hits, Rays, Returns, errors, mirror_indices, penetrate, range_walk, reflect

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from lslam.core.arrays import Floats
 from lslam.core.config.input import Section
 from lslam.core.errors import UsageError, nearest
 from lslam.core.geometry import portable, se3, so3
-from lslam.core.types.arrays import Floats
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats
 from lslam.core.geometry import portable, se3
-from lslam.core.types.arrays import Floats
 from lslam.simulation import furniture
 from lslam.simulation.city import KERB
 from lslam.simulation.curve import RouteCurve, Terrain

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from lslam.core.arrays import Floats
 from lslam.core.errors import InputError
 from lslam.core.geometry import portable
-from lslam.core.types.arrays import Floats
 from lslam.core.types.building import Building, Footprint, footprint_polygon, is_canopy
 from lslam.simulation.city import (
     KERB,

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats
 from lslam.core.errors import InputError, OutputError, cause
 from lslam.core.geometry import portable
 from lslam.core.geometry.geodesy import from_local
-from lslam.core.types.arrays import Floats
 from lslam.core.types.building import Building, Footprint, footprint_polygon, footprints_of
 from lslam.core.untrusted import MISFIT, parse_json
 from lslam.io.formats.atomic import write_text

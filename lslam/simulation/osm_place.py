@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats, Longs
 from lslam.core.errors import InputError, UsageError
 from lslam.core.geometry import portable
 from lslam.core.geometry.geodesy import to_local
-from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.building import Building, footprint_polygon, is_canopy
 from lslam.io.formats.osm_buildings import BuildingExtract, distance_text, is_underground, read_buildings, right_place
 from lslam.io.formats.osm_data import OsmData

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats
 from lslam.core.errors import UsageError
 from lslam.core.geometry import portable, se3, so3
-from lslam.core.types.arrays import Floats
 from lslam.simulation.curve import RouteCurve, Terrain, flat, gaussian_smooth, interpolating_spline
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.core.types.arrays import Floats, Longs
+from lslam.core.arrays import Floats, Longs
 from lslam.simulation.city import City
 from lslam.simulation.scene_mesh import LOOKS, RayScene, Surface
 

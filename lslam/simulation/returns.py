@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from lslam.core.arrays import Bools, Floats, Ints
 from lslam.core.config.input import Section
 from lslam.core.geometry import portable
-from lslam.core.types.arrays import Bools, Floats
 from lslam.simulation.lidar_models import LidarModel
 from lslam.simulation.scene_mesh import SceneMesh, Surface, is_glass
 
-Cast = Callable[[NDArray[np.float32], NDArray[np.float32]], tuple[NDArray[np.float32], NDArray[np.int32]]]
+Cast = Callable[[NDArray[np.float32], NDArray[np.float32]], tuple[NDArray[np.float32], Ints]]
 LAYERS = 8  # surfaces of volumes that a beam passes, at most
 _BEYOND = np.float32(1e-3)  # m behind a surface from which a ray goes on
 VOLUMES = (Surface.CROWN, Surface.HEDGE)
@@ -70,7 +70,7 @@ class Hits:
     distance: NDArray[np.float32]
     cosine: NDArray[np.float32]
     surface: NDArray[np.uint8]
-    face: NDArray[np.int32]
+    face: Ints
 
 
 def penetrate(
@@ -114,7 +114,7 @@ def penetrate(
     _leaf(hits, which, at, facing)
 
 
-def _enters(mesh: SceneMesh, face: NDArray[np.int32], directions: NDArray[np.float32]) -> Bools:
+def _enters(mesh: SceneMesh, face: Ints, directions: NDArray[np.float32]) -> Bools:
     """(N,) whether a ray enters a volume at its face, rather than leaving it."""
     return np.asarray(np.einsum("ij,ij->i", mesh.normals[face], directions) < 0)
 
@@ -128,7 +128,7 @@ def _leaf(hits: Hits, which: NDArray[np.intp], at: NDArray[np.float32], facing: 
 
 
 def _solid(
-    mesh: SceneMesh, rays: Rays, hits: Hits, which: NDArray[np.intp], at: NDArray[np.float32], face: NDArray[np.int32]
+    mesh: SceneMesh, rays: Rays, hits: Hits, which: NDArray[np.intp], at: NDArray[np.float32], face: Ints
 ) -> None:
     hits.distance[which] = at
     hits.cosine[which] = np.abs(np.einsum("ij,ij->i", mesh.normals[face], rays.directions[which]))

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats
 from lslam.core.errors import InputError, UsageError, input_errors, nearest
 from lslam.core.geometry import portable
 from lslam.core.geometry.geodesy import to_local
-from lslam.core.types.arrays import Floats
 from lslam.core.untrusted import MISFIT, parse_json, parse_toml
 from lslam.io.formats.trajectory_files import read_trajectory
 from lslam.simulation.curve import RouteCurve, flat, rounded_rectangle, smooth_curve, winding_line

@@ -10,12 +10,12 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
+from lslam.core.arrays import Floats
 from lslam.core.config.config import read_package_files, setting_value
 from lslam.core.config.input import Section
 from lslam.core.errors import ConfigError, InputError, UsageError, cause, nearest
 from lslam.core.geometry import portable
 from lslam.core.printable import toml_text
-from lslam.core.types.arrays import Floats
 from lslam.core.untrusted import parse_toml
 from lslam.io.formats.kitti_layout import PER_POINT, POINTS
 from lslam.simulation.city import Layout

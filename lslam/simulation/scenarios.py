@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats, Longs
 from lslam.core.errors import UsageError
 from lslam.core.geometry import portable, se3, so3
-from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.gnss import GnssStream
 from lslam.core.types.imu import ImuStream, WheelStream
 from lslam.core.types.scan import Scan

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Bools, Floats, Ints, Longs
 from lslam.core.geometry import portable
-from lslam.core.types.arrays import Bools, Floats, Longs
 
 
 class Surface(IntEnum):
@@ -81,7 +81,7 @@ class SceneMesh:
     """Triangles: vertices (V, 3) float32, m; faces (F, 3) int32 indices; surfaces (F,) uint8 values of `Surface`."""
 
     vertices: NDArray[np.float32]
-    faces: NDArray[np.int32]
+    faces: Ints
     surfaces: NDArray[np.uint8]
 
     @cached_property
@@ -189,9 +189,7 @@ class RayScene:
         self._scene = EmbreeScene()
         self._geometry = TriangleMesh(self._scene, mesh.vertices, mesh.faces)
 
-    def cast(
-        self, origins: NDArray[np.float32], directions: NDArray[np.float32]
-    ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    def cast(self, origins: NDArray[np.float32], directions: NDArray[np.float32]) -> tuple[NDArray[np.float32], Ints]:
         """First hits of rays (N, 3) with unit directions: distances (N,), m, inf where nothing is hit, and faces (N,) or -1."""
         hit = self._scene.run(np.ascontiguousarray(origins), np.ascontiguousarray(directions), output=1)
         faces = np.asarray(hit["primID"], np.int32)

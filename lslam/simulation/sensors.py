@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
+from lslam.core.arrays import Floats, Longs
 from lslam.core.errors import UsageError
 from lslam.core.geometry import geodesy, portable, se3
 from lslam.core.printable import toml_text
-from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.gnss import GnssStream
 from lslam.core.types.imu import WheelStream
 from lslam.core.types.trajectory import Trajectory

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats
 from lslam.core.geometry import portable
-from lslam.core.types.arrays import Floats
 from lslam.simulation.city import (
     City,
     Layout,

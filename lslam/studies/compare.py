@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
+from lslam.core.arrays import Floats
 from lslam.core.config.outputs import EvalConfig
 from lslam.core.errors import LslamError, UsageError
-from lslam.core.types.arrays import Floats
 from lslam.core.types.comparison import Comparison, Difference, Drawing, DrawnRun, RunScore
 from lslam.core.types.sequence import Sequence as Recording
 from lslam.core.types.trajectory import Trajectory

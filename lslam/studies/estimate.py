@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
+from lslam.core.arrays import Floats
 from lslam.core.errors import RunFailedError
 from lslam.core.printable import lasting
-from lslam.core.types.arrays import Floats
 from lslam.io.readers import open_sequence
 from lslam.studies.grid import Job
 from lslam.studies.jobs import Local

@@ -11,13 +11,13 @@ from typing import Literal, NamedTuple
 import numpy as np
 from pydantic import Field, ValidationError
 
+from lslam.core.arrays import Floats
 from lslam.core.config import load_config
 from lslam.core.config.config import explain, read_package_files
 from lslam.core.config.input import Section
 from lslam.core.errors import ConfigError, InputError, UsageError, nearest
 from lslam.core.geometry import geodesy, se2
 from lslam.core.printable import file_safe, significant
-from lslam.core.types.arrays import Floats
 from lslam.core.types.comparison import RunScore, Table
 from lslam.core.untrusted import parse_toml
 from lslam.evaluation.thesis import RPY, Judgement, difficulty, judge_number, judge_order, judge_time, median_and_worst

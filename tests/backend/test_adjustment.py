@@ -9,8 +9,8 @@ from rooms import in_room, walk
 from lslam.backend.adjustment import SweptPoints, adjust, find_planes
 from lslam.backend.graph.marginals import PosePrior
 from lslam.backend.kernels import plane_adjustment
+from lslam.core.arrays import Floats
 from lslam.core.geometry import se3, so3
-from lslam.core.types.arrays import Floats
 
 
 def ate(poses: Floats, truth: Floats) -> float:

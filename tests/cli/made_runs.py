@@ -19,10 +19,10 @@ from pyproj import Transformer
 
 from lslam.backend.control_points import control_residuals
 from lslam.backend.manual import read_control_points, write_control
+from lslam.core.arrays import Floats
 from lslam.core.config import Config
 from lslam.core.geometry import se3, so3
 from lslam.core.geometry.geodesy import local_crs
-from lslam.core.types.arrays import Floats
 from lslam.core.types.cloud import ArrayCloud
 from lslam.core.types.constraint import LoopCandidate, LoopStage, Verdict
 from lslam.core.types.gnss import Georeference

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lslam.core.types.arrays import Floats
+from lslam.core.arrays import Floats
 from lslam.core.types.study import LawKind
 from lslam.evaluation.curves import band, fit_law, rival
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from lslam.core.arrays import Floats
 from lslam.core.geometry import se3
-from lslam.core.types.arrays import Floats
 from lslam.core.types.camera import Image, Lens
 from lslam.core.types.cloud import ArrayCloud
 from lslam.maps.colour import GREY, VIEWS, ColouredCloud, MapColourer, image_gains

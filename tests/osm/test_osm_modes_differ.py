@@ -12,8 +12,8 @@ from shared_odometry import SharedOdometry
 from wrong_maps import MODES, OFF, SHIFT, Found, on
 
 from lslam.backend.keyframes.store import KeyframeStore
+from lslam.core.arrays import Floats
 from lslam.core.config import Config
-from lslam.core.types.arrays import Floats
 from lslam.io.formats.osm_buildings import BuildingExtract
 from lslam.osm import hold
 from lslam.osm.location import MapLocations, locate

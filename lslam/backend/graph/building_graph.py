@@ -28,11 +28,11 @@ from lslam.backend.graph.solve import (
     join_factors,
     truncated_weights,
 )
+from lslam.core.arrays import Bools, Floats
 from lslam.core.config.backend import GraphConfig
 from lslam.core.geometry import noise, se2, se3
 from lslam.core.geometry.noise import quantile
 from lslam.core.stopping import checking
-from lslam.core.types.arrays import Bools, Floats
 from lslam.core.types.building import BuildingMatch
 
 PROBABILITY = 0.999  # chi-square quantile of an inlier match

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.backend.graph.problem import PoseGraph, PositionFix
+from lslam.core.arrays import Floats
 from lslam.core.config.backend import GraphConfig
 from lslam.core.geometry import noise, se3, so3
 from lslam.core.geometry.noise import RIGHT_PROBABILITY, chance_of_median, quantile, squared_distances
-from lslam.core.types.arrays import Floats
 from lslam.core.types.constraint import Constraint
 
 # Loop closures used at most, evenly spread, and bounds of the factor on the drift's variance.

@@ -15,8 +15,8 @@ import numpy as np
 
 from lslam.backend.graph.fix_noise import GaussMarkovNoise
 from lslam.backend.graph.problem import FloorPlane, PlanarPrior, PoseGraph, PositionFix
+from lslam.core.arrays import Floats
 from lslam.core.geometry import noise, se2, se3, so3
-from lslam.core.types.arrays import Floats
 from lslam.core.types.constraint import Constraint, Turn
 from lslam.core.types.imu import GRAVITY, InertialChain, InertialStep, SmootherNoise
 

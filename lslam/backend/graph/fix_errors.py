@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Bools, Floats
 from lslam.core.geometry import se2
 from lslam.core.geometry.noise import quantile
-from lslam.core.types.arrays import Bools, Floats
 
 # s; offsets that are tried, their step, and the time over which displacements are compared.
 LARGEST_S, STEP_S, LAG_S = 2.5, 0.05, 1.0

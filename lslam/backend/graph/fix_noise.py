@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.backend.graph.fix_errors import NO_HEIGHT
+from lslam.core.arrays import Bools, Floats
 from lslam.core.geometry.noise import quantile
-from lslam.core.types.arrays import Bools, Floats
 
 # Size of the covariance: more fixes are averaged in groups.
 MOST = 60

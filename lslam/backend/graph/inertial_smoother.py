@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from lslam.backend.graph.factors import preintegrate, regularise
+from lslam.core.arrays import Floats
 from lslam.core.errors import GraphError
 from lslam.core.geometry import noise, se3
-from lslam.core.types.arrays import Floats
 from lslam.core.types.imu import InertialState, InertialStep, SmootherNoise
 from lslam.core.types.state import State, Stateful
 from lslam.io.formats.state_files import Records

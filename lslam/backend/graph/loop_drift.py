@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from lslam.backend.graph.drift import LASTING, SIZES, chains, correct_drift, linear_basis, mean_rates, rate_roots
 from lslam.backend.graph.pose_graph import Ends, check_graph, judge_loops, transport_twists, with_distances
 from lslam.backend.graph.problem import EstimatedDrift, PoseGraph
+from lslam.core.arrays import Floats
 from lslam.core.config.backend import GraphConfig
 from lslam.core.geometry import noise, se3, so3
 from lslam.core.geometry.noise import RIGHT_PROBABILITY, quantile
 from lslam.core.stopping import checking
-from lslam.core.types.arrays import Floats
 from lslam.core.types.constraint import Constraint
 
 # Loop closures used at most, evenly spread.

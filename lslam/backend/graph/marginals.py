@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
+from lslam.core.arrays import Floats
 from lslam.core.errors import GraphError
 from lslam.core.geometry import noise, se3
 from lslam.core.stopping import checking
-from lslam.core.types.arrays import Floats
 
 
 @dataclass(frozen=True)

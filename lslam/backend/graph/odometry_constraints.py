@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from lslam.backend.graph.drift import drift_covariance
 from lslam.backend.graph.factors import PLANAR
+from lslam.core.arrays import Floats
 from lslam.core.config.backend import GraphConfig
 from lslam.core.geometry import noise, se3, so3
-from lslam.core.types.arrays import Floats
 from lslam.core.types.constraint import Constraint
 from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.trajectory import Keyframe

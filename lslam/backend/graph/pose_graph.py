@@ -20,12 +20,12 @@ from lslam.backend.graph.drift import drift_factor, with_drift
 from lslam.backend.graph.marginals import marginal_blocks, marginals, pose_prior
 from lslam.backend.graph.problem import PoseGraph, Solution
 from lslam.backend.graph.solve import GncResult, OutlierCandidate, gnc_solve, join_factors, solve, solve_incrementally
+from lslam.core.arrays import Bools, Floats
 from lslam.core.config.backend import GraphConfig
 from lslam.core.errors import GraphError
 from lslam.core.geometry import noise, se3
 from lslam.core.geometry.noise import RIGHT_PROBABILITY, quantile, squared_distances
 from lslam.core.stopping import check_stop
-from lslam.core.types.arrays import Bools, Floats
 from lslam.core.types.constraint import Constraint, LoopStage
 
 # Neighbours that each loop closure is tested against, and the share that must agree.

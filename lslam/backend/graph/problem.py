@@ -9,7 +9,7 @@ import numpy as np
 
 from lslam.backend.graph.fix_noise import GaussMarkovNoise
 from lslam.backend.graph.marginals import PosePrior
-from lslam.core.types.arrays import Bools, Floats
+from lslam.core.arrays import Bools, Floats
 from lslam.core.types.constraint import Constraint, LoopStage, Turn
 from lslam.core.types.imu import InertialChain
 

@@ -10,11 +10,11 @@ import numpy as np
 
 from lslam.backend.graph.factors import BIAS_KEY, FIX_NOISE, SPEED_KEY, keyframe_of
 from lslam.backend.graph.marginals import first_line
+from lslam.core.arrays import Floats
 from lslam.core.config.backend import GraphConfig
 from lslam.core.errors import GraphError
 from lslam.core.geometry.noise import RIGHT_PROBABILITY, quantile
 from lslam.core.stopping import check_stop
-from lslam.core.types.arrays import Floats
 
 # Keyframes that iSAM2 takes in per update.
 BATCH = 10

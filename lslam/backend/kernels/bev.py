@@ -11,10 +11,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats, Longs
 from lslam.core.kernels.jit import inline, kernel
 
-Floats = NDArray[np.float64]
-Longs = NDArray[np.int64]
 Image = NDArray[np.float32]
 Row = NDArray[np.float32]
 OUTSIDE = -1

@@ -8,14 +8,11 @@ Pose corrections are x = (t, r), 6: t in m, r in rad about the sensor, world axe
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats, Longs
 from lslam.core.kernels.jit import inline, inline_with_arrays, kernel
 from lslam.core.kernels.linalg import eigen, inverse
 from lslam.core.kernels.voxel import index_of, pack, place_of, table_size
-
-Floats = NDArray[np.float64]
-Longs = NDArray[np.int64]
 
 
 @kernel

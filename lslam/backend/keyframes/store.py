@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats, Points
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.errors import InputError, OutputError, cause
 from lslam.core.geometry import se3
 from lslam.core.kernels import voxel as voxels
 from lslam.core.kernels.transform import transform
-from lslam.core.types.arrays import Floats, Points
 from lslam.core.types.state import Stateful
 from lslam.core.types.trajectory import Keyframe
 from lslam.io.formats.bag_chunks import zstd

@@ -26,10 +26,10 @@ from lslam.backend.localization.prior_map import (
 from lslam.backend.loops.gating import GATE_SIGMAS, LoopThrottle
 from lslam.backend.loops.level_submap import find_up, level_rotation, make_level_submap, move_points
 from lslam.backend.loops.verify import SubmapRegistration
+from lslam.core.arrays import Floats
 from lslam.core.config.config import Config
 from lslam.core.geometry import noise, se3, so3
 from lslam.core.geometry.noise import quantile
-from lslam.core.types.arrays import Floats
 from lslam.core.types.constraint import FixStatus, MapFix, Verdict
 from lslam.core.types.scan import LEVER_M
 from lslam.core.types.scan_result import ScanResult

@@ -32,10 +32,10 @@ from lslam.backend.loops.level_submap import (
     peaks,
     spectra,
 )
+from lslam.core.arrays import Floats, Longs, Points
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.errors import InputError
 from lslam.core.geometry import se2, se3, so3
-from lslam.core.types.arrays import Floats, Longs, Points
 from lslam.core.types.gnss import Georeference
 from lslam.registration.alignment import MapAlignment
 from lslam.registration.gaussian_map import GaussianMap

@@ -12,11 +12,11 @@ from lslam.backend.keyframes.store import KeyframeStore, mounted_up, submap
 from lslam.backend.localization.locate import PlaceFinder, Start, StartPrior
 from lslam.backend.localization.prior_map import PlaceSearch, make_prior_map
 from lslam.backend.loops.level_submap import move_points
+from lslam.core.arrays import Floats, Points
 from lslam.core.config.config import Config
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.geometry import geodesy, noise, se3
 from lslam.core.kernels import voxel
-from lslam.core.types.arrays import Floats, Points
 from lslam.core.types.constraint import Constraint
 from lslam.core.types.gnss import Georeference
 from lslam.core.types.scan_result import ScanResult

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from lslam.core.arrays import Longs
     from lslam.core.config.backend import LoopsConfig
-    from lslam.core.types.arrays import Longs
 
 GROUP = "lslam.descriptors"
 # name -> (module with `create(config) -> PlaceDescriptor`, one line for people)

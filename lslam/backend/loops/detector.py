@@ -24,11 +24,11 @@ from lslam.backend.loops.gating import (
 )
 from lslam.backend.loops.level_submap import find_up, level_keyframes, make_level_submap, move_points
 from lslam.backend.loops.verify import Verification, Verifier
+from lslam.core.arrays import Floats, Longs, Points
 from lslam.core.config.backend import LoopsConfig
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.errors import InterruptedRunError
 from lslam.core.geometry import noise, se3, so3
-from lslam.core.types.arrays import Floats, Longs, Points
 from lslam.core.types.constraint import Constraint, KnownPair, LoopCandidate, LoopStage, Verdict
 from lslam.core.types.scan_result import KeyframeClocks, StageClock
 from lslam.core.types.trajectory import Keyframe

@@ -13,11 +13,11 @@ from lslam.backend.loops.detector import LEAST_REACH, Detector
 from lslam.backend.loops.gating import OdometryUncertainty
 from lslam.backend.loops.level_submap import make_level_submap, move_points
 from lslam.backend.loops.verify import Verifier
+from lslam.core.arrays import Floats, Points
 from lslam.core.config.backend import LoopsConfig
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.errors import InterruptedRunError
 from lslam.core.geometry import se3
-from lslam.core.types.arrays import Floats, Points
 from lslam.core.types.constraint import KnownPair, LoopCandidate, LoopStage
 from lslam.core.types.run_record import PairView, RunRecord
 from lslam.core.types.scan_result import KeyframeClocks

@@ -17,8 +17,8 @@ from typing import Generic, TypeVar
 import numpy as np
 
 from lslam.backend.kernels import gating
+from lslam.core.arrays import Floats, Longs
 from lslam.core.geometry import so3
-from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.constraint import LoopCandidate, LoopStage, Verdict
 from lslam.core.types.trajectory import Keyframe
 

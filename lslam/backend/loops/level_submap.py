@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.backend.kernels import bev
+from lslam.core.arrays import Bools, Floats, Longs, Points
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.geometry import noise, se3, so3
 from lslam.core.kernels import gaussians
 from lslam.core.kernels.transform import transform
-from lslam.core.types.arrays import Bools, Floats, Longs, Points
 from lslam.core.types.trajectory import Keyframe
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.local_map import COARSE_FACTOR

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from lslam.backend.kernels.bev import polar_image
 from lslam.backend.loops import PlaceMatch
+from lslam.core.arrays import Bools, Floats, Longs
 from lslam.core.config.backend import LoopsConfig
-from lslam.core.types.arrays import Bools, Floats, Longs
 
 Images = NDArray[np.float32]
 

@@ -18,10 +18,10 @@ from lslam.backend.loops.level_submap import (
     peaks,
     spectra,
 )
+from lslam.core.arrays import Floats
 from lslam.core.config.backend import LoopsConfig
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.geometry import se2, se3, so3
-from lslam.core.types.arrays import Floats
 from lslam.core.types.constraint import LoopStage
 from lslam.registration.acceptance import Acceptance
 from lslam.registration.alignment import solve

@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats
 from lslam.core.errors import UsageError
 from lslam.core.geometry import se3, so3
 from lslam.core.untrusted import whole_number
-
-Floats = NDArray[np.float64]
 
 # deg; about the places for which an operation is chosen.
 MARGIN_DEG = 0.01

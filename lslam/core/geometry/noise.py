@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats
 from lslam.core.geometry import so3
-
-Floats = NDArray[np.float64]
 
 
 def changes(T: NDArray[Any], after: NDArray[Any]) -> Floats:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from lslam.core.arrays import Floats
 
 
 def wrap(angle: NDArray[Any] | float) -> Floats:

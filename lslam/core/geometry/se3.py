@@ -13,10 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Bools, Floats, Stamps
 from lslam.core.geometry import portable, so3
-
-Floats = NDArray[np.float64]
-Stamps = NDArray[np.int64]
 
 
 def make(R: NDArray[Any], t: NDArray[Any]) -> Floats:
@@ -206,7 +204,7 @@ class ContinuousMotion:
             turning = RotationSpline(seconds, Rotation.from_matrix(poses[:, :3, :3]))
             self._parts.append((stamps, CubicSpline(seconds, poses[:, :3, 3]), turning))
 
-    def at(self, stamps_ns: Stamps) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+    def at(self, stamps_ns: Stamps) -> tuple[Floats, Floats, Bools]:
         """Poses (K, 4, 4) and turning rates (K,), rad/s, at `stamps_ns` (K,), and whether a stretch covers the instant."""
         poses, rates = np.tile(np.eye(4), (len(stamps_ns), 1, 1)), np.zeros(len(stamps_ns))
         within = np.zeros(len(stamps_ns), np.bool_)

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Bools, Floats
 from lslam.core.geometry import portable
 
-Floats = NDArray[np.float64]
 # Length of x as seen from above, below which it is vertical: 15 deg.
 _STEEP = 0.25
 
@@ -178,7 +178,7 @@ def from_quaternion(q: NDArray[Any]) -> Floats:
     return m
 
 
-def is_rotation(R: NDArray[Any], tolerance: float) -> NDArray[np.bool_]:
+def is_rotation(R: NDArray[Any], tolerance: float) -> Bools:
     """(...,) whether each (..., 3, 3) matrix is a rotation up to `tolerance` in R^T R; False where numbers are not finite."""
     R = np.asarray(R, np.float64)
     if R.ndim == 2:

@@ -6,9 +6,10 @@ import math
 
 import numpy as np
 
+from lslam.core.arrays import Floats
 from lslam.core.kernels.jit import inline, inline_with_arrays, kernel
 from lslam.core.kernels.linalg import eigen, extent, rotate_in_place
-from lslam.core.kernels.linearisation import INFORMATION, LEVER, MATCHED, POPULATION, Floats, Pose, Sums
+from lslam.core.kernels.linearisation import INFORMATION, LEVER, MATCHED, POPULATION, Pose, Sums
 from lslam.core.kernels.residuals import solve_on_surfaces
 
 Limits = tuple[float, float, float]

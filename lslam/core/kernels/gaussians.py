@@ -25,13 +25,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats, Ints, Longs
 from lslam.core.kernels.jit import inline, kernel
 from lslam.core.kernels.linalg import plane_of
 from lslam.core.kernels.voxel import BLOCK, MASK, OFFSET, hash_key, index_of, pack, place_of
-
-Floats = NDArray[np.float64]
-Longs = NDArray[np.int64]
-Ints = NDArray[np.int32]
 
 FREE = -1
 EMPTY, BLOB = -2.0, -1.0

@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats
 from lslam.core.kernels.jit import inline, kernel
 
 NO_HEIGHT = 1e30
@@ -21,7 +22,7 @@ def cell_of(x: float, y: float, inverse: float, half: int) -> int:
 
 
 @kernel
-def lowest(points: NDArray[np.float32], R: NDArray[np.float64], cell: float, half: int) -> NDArray[np.int64]:
+def lowest(points: NDArray[np.float32], R: Floats, cell: float, half: int) -> NDArray[np.int64]:
     """Index (4 half^2,) of the lowest point, after rotation by R, in each cell of `cell` m; -1 for empty cells."""
     found, height = np.empty(4 * half * half, np.int64), np.empty(4 * half * half)
     found[:] = -1
@@ -40,9 +41,7 @@ def lowest(points: NDArray[np.float32], R: NDArray[np.float64], cell: float, hal
 
 
 @kernel
-def best_plane(
-    points: NDArray[np.float64], triples: NDArray[np.int64], tolerance: float, upright: float
-) -> NDArray[np.float64]:
+def best_plane(points: Floats, triples: NDArray[np.int64], tolerance: float, upright: float) -> Floats:
     """Plane n x, n y, n z, d (n p + d = 0, n upwards) through one of the triples (K, 3), or zeros when none is valid.
 
     The best has the highest number of points (N, 3) within `tolerance`, minus those below it: nothing lies under the
@@ -77,7 +76,7 @@ def best_plane(
 
 
 @kernel
-def envelope(height: NDArray[np.float64], rise: float, tolerance: float) -> NDArray[np.float64]:
+def envelope(height: Floats, rise: float, tolerance: float) -> Floats:
     """Highest possible ground in each cell of `height` (n, n): the lowest cone, rising `rise` m per cell, over any cell.
 
     A cell supports a cone when at least a quarter of the cells within two of it, one or more, are as low, up to `tolerance`, m,
@@ -132,10 +131,10 @@ def envelope(height: NDArray[np.float64], rise: float, tolerance: float) -> NDAr
 @kernel
 def above(
     points: NDArray[np.float32],
-    R: NDArray[np.float64],
+    R: Floats,
     cell: float,
     half: int,
-    top: NDArray[np.float64],
+    top: Floats,
     tolerance: float,
 ) -> NDArray[np.int64]:
     """Indices of the points more than `tolerance`, m, over the ground `top` (2 half, 2 half), and of all outside of the grid.

@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats
 from lslam.core.kernels.jit import inline, kernel
-
-Floats = NDArray[np.float64]
 
 
 @inline
@@ -51,7 +50,7 @@ def plane_of(
 
 
 @kernel
-def eigen(matrix: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def eigen(matrix: Floats) -> tuple[Floats, Floats]:
     """Eigenvalues (n,) and eigenvectors in columns (n, n) of a small symmetric matrix, by cyclic Jacobi rotations.
 
     The last bits of LAPACK's results depend on vendor and threads; these loops give the same bytes everywhere.
@@ -99,7 +98,7 @@ def eigen(matrix: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.
 
 
 @inline
-def rotate_in_place(R: NDArray[np.float64], wx: float, wy: float, wz: float) -> None:
+def rotate_in_place(R: Floats, wx: float, wy: float, wz: float) -> None:
     """R <- exp((wx, wy, wz)) R in place, then back onto SO(3) by Gram-Schmidt of its rows."""
     theta2 = wx * wx + wy * wy + wz * wz
     theta = math.sqrt(theta2)
@@ -183,7 +182,7 @@ def invert_symmetric(
 
 
 @inline
-def rotate_symmetric(R: NDArray[np.float64], q: NDArray[np.float64]) -> tuple[float, float, float, float, float, float]:
+def rotate_symmetric(R: Floats, q: Floats) -> tuple[float, float, float, float, float, float]:
     """R C R^T of a symmetric matrix given by its six entries: xx, xy, xz, yy, yz, zz."""
     a00 = R[0, 0] * q[0] + R[0, 1] * q[1] + R[0, 2] * q[2]
     a01 = R[0, 0] * q[1] + R[0, 1] * q[3] + R[0, 2] * q[4]

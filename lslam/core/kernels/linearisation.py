@@ -17,18 +17,12 @@ Pose update: t <- t + d[:3], R <- exp(d[3:]) R, so a residual n . (R s + t - m) 
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
-Floats = NDArray[np.float64]
-Longs = NDArray[np.int64]
-Ints = NDArray[np.int32]
-Flags = NDArray[np.bool_]
+from lslam.core.arrays import Bools, Floats, Ints, Longs
 
 Settings = tuple[float, float, float, float, float, bool]
 # Octant cell (S,) and slots (S, 8) of each point; its nearest plane and blob (S, 2), and the sphere within which these are the
 # nearest (S, 4), see `residuals.nearest`; whether it is matched (S,); its squared distance (S,), m2, -1 where it is not.
-Search = tuple[Longs, Ints, Ints, Floats, Flags, Floats]
+Search = tuple[Longs, Ints, Ints, Floats, Bools, Floats]
 Pose = tuple[Floats, Floats]
 Width = tuple[float, float, float]
 Sums = tuple[Floats, Floats, Floats, Floats]

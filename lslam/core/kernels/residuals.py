@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from lslam.core.arrays import Floats, Ints, Longs
 from lslam.core.kernels.gaussians import BLOB, EMPTY, find
 from lslam.core.kernels.jit import inline, inline_with_arrays, kernel
 from lslam.core.kernels.linalg import add_gradient, add_matrix, eigen
@@ -17,9 +18,6 @@ from lslam.core.kernels.linearisation import (
     ROBUST,
     SIGNIFICANT_SIGMAS,
     SQUARED,
-    Floats,
-    Ints,
-    Longs,
     Pose,
     Search,
     Settings,

@@ -7,13 +7,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats
 from lslam.core.kernels.jit import kernel
-
-Floats = NDArray[np.float32]
 
 
 @kernel
-def transform(points: NDArray[np.float32], T: NDArray[np.float64], out: NDArray[np.float32]) -> None:
+def transform(points: NDArray[np.float32], T: Floats, out: NDArray[np.float32]) -> None:
     """Write T (4, 4) applied to points (N, 3), m, into `out` (N, 3); computed in float64."""
     for i in range(len(points)):
         x, y, z = float(points[i, 0]), float(points[i, 1]), float(points[i, 2])
@@ -22,9 +21,7 @@ def transform(points: NDArray[np.float32], T: NDArray[np.float64], out: NDArray[
 
 
 @kernel
-def deskew(
-    points: Any, times: NDArray[np.float32], start: float, step: float, knots: NDArray[np.float64], out: Any
-) -> None:
+def deskew(points: Any, times: NDArray[np.float32], start: float, step: float, knots: Floats, out: Any) -> None:
     """Write points (N, 3), m, transformed by the pose at their times (N,), s, to `out` (N, 3).
 
     A time that is not finite counts as 0.

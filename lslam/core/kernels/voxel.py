@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats, Ints
 from lslam.core.kernels.jit import inline, kernel
 from lslam.core.kernels.linalg import extent
 
@@ -57,7 +58,7 @@ def _passes(
     range_min: float,
     range_max: float,
     is_cylinder: bool,
-    box: NDArray[np.float64],
+    box: Floats,
 ) -> bool:
     """Whether a point a, b, c, m, is finite, not zero, inside the range gate and outside the ego box; the rest as in `gate`."""
     x, y, z = float(a), float(b), float(c)
@@ -73,7 +74,7 @@ def _passes(
 
 @kernel
 def gate(
-    points: NDArray[np.float32], range_min: float, range_max: float, is_cylinder: bool, box: NDArray[np.float64]
+    points: NDArray[np.float32], range_min: float, range_max: float, is_cylinder: bool, box: Floats
 ) -> NDArray[np.int64]:
     """Indices of the points (N, 3), m, that are finite, not zero, inside the range gate and outside the ego box.
 
@@ -96,7 +97,7 @@ def select_in_gate(
     range_min: float,
     range_max: float,
     is_cylinder: bool,
-    box: NDArray[np.float64],
+    box: Floats,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """The points (K, 3) that `gate` keeps with the same arguments, and their times (K,); `times` is (N,) or empty."""
     n = len(points)
@@ -134,7 +135,7 @@ def take(points: NDArray[np.float32], index: NDArray[np.int64]) -> NDArray[np.fl
 
 
 @inline
-def place_of(key: int, keys: NDArray[np.int64], table: NDArray[np.int32]) -> int:
+def place_of(key: int, keys: NDArray[np.int64], table: Ints) -> int:
     """Position of a key in an open-addressed table of slots, or the free position for it."""
     mask = len(table) - 1
     h = hash_key(key, mask)
@@ -155,7 +156,7 @@ def table_size(n: int) -> int:
 @kernel
 def centroids(
     points: NDArray[np.float32], times: NDArray[np.float32], size: float
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.int32]]:
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], Ints]:
     """One centroid per voxel in order of first appearance: (M, 3) float32, mean time (M,), scatter (M, 6), count (M,).
 
     The scatter is the covariance xx, xy, xz, yy, yz, zz of the voxel's points, m2. Sums run relative to the first point
@@ -240,7 +241,7 @@ def centroids(
 @kernel
 def means(
     points: NDArray[np.float32], times: NDArray[np.float32], size: float
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int32]]:
+) -> tuple[NDArray[np.float32], NDArray[np.float32], Ints]:
     """Centroids in voxels of `size`, m, like `centroids`: (M, 3) float32, mean time (M,), count (M,), with the same bits."""
     n, coordinates = len(points), np.ascontiguousarray(points).reshape(-1)
     table = np.empty(table_size(n), np.int32)
@@ -308,7 +309,7 @@ def means(
 
 @kernel
 def find_neighboured_cells(
-    points: NDArray[np.float32], counts: NDArray[np.int32], least: float, size: float, least_around: float
+    points: NDArray[np.float32], counts: Ints, least: float, size: float, least_around: float
 ) -> NDArray[np.int64]:
     """Indices of the points (N, 3) whose count times range reaches `least`, and whose voxel's count reaches `least_around`.
 

@@ -9,8 +9,8 @@ from typing import Any, Literal
 
 import numpy as np
 
+from lslam.core.arrays import Floats, Longs
 from lslam.core.geometry import se2
-from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.constraint import Verdict
 
 MatchKind = Literal["edges", "lines", "none"]

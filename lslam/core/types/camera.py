@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats, Longs
 from lslam.core.errors import InputError
-from lslam.core.types.arrays import Floats, Longs
 
 Image = NDArray[np.uint8]
 # Number of distortion coefficients by model, in OpenCV's order: k1 k2 p1 p2 k3 k4 k5 k6, of a fisheye k1 k2 k3 k4.

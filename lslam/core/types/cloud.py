@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.core.types.arrays import Floats
+from lslam.core.arrays import Floats
 
 BLOCK = 1 << 18
 # Columns beside the points, (N,) each, by name. Those that lslam knows: `time_ns` int64, clock of the recording; `scan` uint16 or

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 if TYPE_CHECKING:
-    from lslam.core.types.arrays import Floats
+    from lslam.core.arrays import Floats
 
 
 @dataclass(frozen=True)

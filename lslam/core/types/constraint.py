@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from lslam.core.types.arrays import Floats
+from lslam.core.arrays import Floats
 
 ConstraintKind = Literal["odometry", "loop"]
 

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from lslam.core.types.arrays import Bools, Floats, Longs
+from lslam.core.arrays import Bools, Floats, Longs
 
 
 @dataclass(frozen=True)

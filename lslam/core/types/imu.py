@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
-from lslam.core.types.arrays import Floats, Longs
+from lslam.core.arrays import Floats, Longs
 
 # m/s2, the standard gravity of Earth.
 GRAVITY = 9.80665

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lslam.core.arrays import Floats, Longs
 from lslam.core.geometry.se3 import poses_at
-from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.imu import SweepLink
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.core.types.arrays import Floats, Longs, Points
+from lslam.core.arrays import Floats, Longs, Points
 from lslam.core.types.building import CorrectedMap, OsmMatches
 from lslam.core.types.cloud import ArrayCloud
 from lslam.core.types.constraint import LoopCandidate, MapFix, Turn

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.core.types.arrays import Bools
+from lslam.core.arrays import Bools
 
 # m along each axis: no LiDAR that is carried along the ground or a little above sees as far.
 FARTHEST_M = 10_000.0

@@ -11,8 +11,8 @@ from typing import Literal
 
 import numpy as np
 
+from lslam.core.arrays import Floats
 from lslam.core.geometry import noise, portable, se3, so3
-from lslam.core.types.arrays import Floats
 from lslam.core.types.imu import ImuDiagnostics
 from lslam.core.types.scan import LEVER_M
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lslam.core.types.arrays import Floats, Longs
+from lslam.core.arrays import Floats, Longs
 
 
 @dataclass(frozen=True)

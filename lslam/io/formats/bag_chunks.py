@@ -19,8 +19,8 @@ from zlib import crc32
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Longs
 from lslam.core.errors import InputError, input_errors
-from lslam.core.types.arrays import Longs
 from lslam.io.remote import RemotePath
 
 BLOCK = 1 << 15

@@ -21,10 +21,10 @@ from zlib import error as zlib_error
 
 import numpy as np
 
+from lslam.core.arrays import Longs
 from lslam.core.errors import InputError, OutputError, UsageError, cause, input_errors
 from lslam.core.kernels.cache import cache_folder
 from lslam.core.printable import first_of
-from lslam.core.types.arrays import Longs
 from lslam.io.formats.bag_chunks import LARGEST, Topic, damage, unpack, zstd
 from lslam.io.formats.bag_listing import SUFFIXES, left_out, list_bag_files, missing_parts, packing_of, suffix_of
 from lslam.io.formats.bag_records import ChunkedBag

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from lslam.core.arrays import Floats, Longs
 from lslam.core.errors import InputError
 from lslam.core.geometry import se3, so3
-from lslam.core.types.arrays import Floats, Longs
 from lslam.io.formats.bag_files import Bag, BagTopic, read_header
 
 Transforms = dict[tuple[str, str], Floats]

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.core.types.arrays import Longs
+from lslam.core.arrays import Ints, Longs
 
 SUFFIX = ".copc.laz"
 # Record of LAS 1.4 that tells of the octree; it has to be the first, behind the header.
@@ -29,7 +29,7 @@ def is_copc(path: Path) -> bool:
     return path.name.lower().endswith(SUFFIX)
 
 
-def octree(axes: Sequence[NDArray[np.int32]], edge: int) -> tuple[Longs, NDArray[np.int32]]:
+def octree(axes: Sequence[Ints], edge: int) -> tuple[Longs, Ints]:
     """Nodes of points in a cube of `edge` steps; axes : x, y, z (N,) of the points, whole steps from its lowest corner.
 
     A node with many points keeps the first one of each of its cells, and its eight children get the others, down to cells as
@@ -59,14 +59,12 @@ def octree(axes: Sequence[NDArray[np.int32]], edge: int) -> tuple[Longs, NDArray
     return np.concatenate(keys) if count else np.zeros((1, 4), np.int64), node_of
 
 
-def _boxes(steps: NDArray[np.int32], size: float, most: int) -> Longs:
+def _boxes(steps: Ints, size: float, most: int) -> Longs:
     """(N,) number of the box of `size` steps that each coordinate lies in; the last of `most` has its far side."""
     return np.minimum((steps / size).astype(np.int64), most - 1)
 
 
-def _box_numbers(
-    axes: Sequence[NDArray[np.int32]], some: NDArray[np.int32], size: float, most: int, side: int
-) -> Longs:
+def _box_numbers(axes: Sequence[Ints], some: Ints, size: float, most: int, side: int) -> Longs:
     """(M,) number of the box of each of the points `some`, in the cube of `side` boxes along each axis that it belongs to."""
     packed = np.zeros(len(some), np.int64)
     for axis in axes:

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats
 from lslam.core.errors import InputError, cause
-from lslam.core.types.arrays import Floats
 from lslam.core.untrusted import MISFIT, parse_json
 from lslam.io.formats.atomic import write_text
 from lslam.io.formats.osm_data import DECIMALS

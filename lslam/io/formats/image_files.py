@@ -9,9 +9,9 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats
 from lslam.core.errors import InputError, input_errors
 from lslam.core.extras import importing
-from lslam.core.types.arrays import Floats
 from lslam.core.types.camera import Image
 from lslam.io.formats.atomic import atomic_write
 

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from lslam.core.arrays import Floats, Longs
 from lslam.core.errors import InputError, LslamError, UsageError, cause, input_errors
 from lslam.core.geometry import portable, se3, so3
-from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.scan import Scan
 from lslam.core.types.trajectory import Trajectory
 from lslam.core.untrusted import is_file, whole_number

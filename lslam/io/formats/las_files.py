@@ -20,10 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.core import __version__
+from lslam.core.arrays import Floats, Longs
 from lslam.core.errors import InputError, OutputError, cause
 from lslam.core.extras import importing
 from lslam.core.labels import asprs_table
-from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.cloud import BLOCK, TIME_NS, ArrayCloud, Cloud, CloudBlock, Columns, in_memory
 from lslam.io.formats.atomic import atomic_write
 from lslam.io.formats.copc_files import INFO, INFO_BYTES, USER_ID, copc_bytes, is_copc

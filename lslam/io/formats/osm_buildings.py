@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats
 from lslam.core.errors import InputError
 from lslam.core.geometry.geodesy import to_local
-from lslam.core.types.arrays import Floats
 from lslam.core.types.building import Building, Footprint, footprints_of
 from lslam.io.formats.osm_data import OsmData, Relation, Way
 from lslam.io.formats.osm_files import read_osm

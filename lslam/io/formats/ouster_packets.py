@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats, Longs
 from lslam.core.errors import InputError, input_errors
 from lslam.core.geometry import se3
-from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.imu import ImuStream
 from lslam.core.untrusted import MISFIT, parse_json
 from lslam.io.formats.point_cloud import PointCloud

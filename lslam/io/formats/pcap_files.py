@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Bools, Longs
 from lslam.core.errors import InputError, UsageError, input_errors
-from lslam.core.types.arrays import Bools, Longs
 from lslam.io.remote import RemotePath
 
 # First bytes of a pcap: byte order, and ns per unit of the second word of its times.

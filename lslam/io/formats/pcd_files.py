@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats
 from lslam.core.errors import InputError, input_errors
-from lslam.core.types.arrays import Floats
 from lslam.core.untrusted import whole_number
 from lslam.io.formats.point_cloud import AXES, beyond, packed_columns, ring_column, text_columns
 

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats, Longs
 from lslam.core.errors import InputError
-from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.scan import NO_RING, has_return
 from lslam.io.formats.time_columns import UNIT_OF, UNITS
 

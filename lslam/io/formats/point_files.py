@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats
 from lslam.core.errors import InputError, UsageError, input_errors
-from lslam.core.types.arrays import Floats
 from lslam.core.types.cloud import BLOCK, TIME_NS, ArrayCloud, Cloud, CloudBlock, Columns
 from lslam.core.untrusted import MISFIT
 from lslam.io.formats.atomic import atomic_write

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.core.types.arrays import Floats
+from lslam.core.arrays import Floats
 
 # Records of mixed types: of Livox, Ouster, Velodyne, Aeva, Hesai and RoboSense drivers, packed and padded as PCL does.
 _MIXED_RECORDS = (

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Longs
 from lslam.core.errors import InputError
-from lslam.core.types.arrays import Longs
 from lslam.io.formats import velodyne_packets
 from lslam.io.formats.bag_files import Bag, BagTopic, read_header
 from lslam.io.formats.ouster_packets import IMU_SIZE

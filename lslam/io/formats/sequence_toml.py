@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from lslam.core.arrays import Floats
 from lslam.core.errors import InputError, input_errors, nearest
 from lslam.core.geometry import so3
 from lslam.core.printable import toml_text
-from lslam.core.types.arrays import Floats
 from lslam.core.types.camera import MODELS, Lens
 from lslam.core.untrusted import parse_toml
 from lslam.io.formats.atomic import write_text

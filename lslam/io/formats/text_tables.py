@@ -16,8 +16,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lslam.core.arrays import Bools, Floats, Longs
 from lslam.core.errors import InputError, cause
-from lslam.core.types.arrays import Bools, Floats, Longs
 
 LARGEST_NS = 2**62
 DAY = r"\d{4}[-/]\d\d[-/]\d\d"

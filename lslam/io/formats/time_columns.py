@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lslam.core.arrays import Floats, Longs
 from lslam.core.errors import InputError
-from lslam.core.types.arrays import Floats, Longs
 from lslam.io.formats.text_tables import Row, TextTable, date_to_ns, read_rows, seconds_to_ns, text_table
 from lslam.io.remote import as_path
 

@@ -10,10 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lslam.core.arrays import Floats
 from lslam.core.errors import InputError
 from lslam.core.geometry import se3, so3
 from lslam.core.printable import first_of
-from lslam.core.types.arrays import Floats
 from lslam.core.types.trajectory import Trajectory
 from lslam.io.formats.atomic import write_text
 from lslam.io.formats.text_tables import TextTable, looks_like_header, utc_of

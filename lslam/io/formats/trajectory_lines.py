@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
+from lslam.core.arrays import Floats, Longs
 from lslam.core.errors import InputError
 from lslam.core.geometry import noise, so3
-from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.constraint import Constraint
 from lslam.core.types.trajectory import Trajectory
 from lslam.io.formats import trajectory_csv

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.core.types.arrays import Bools, Longs
+from lslam.core.arrays import Bools, Longs
 from lslam.io.formats.point_cloud import PointCloud
 
 SIZE, BLOCKS, SLOTS = 1206, 12, 32

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
+from lslam.core.arrays import Floats, Longs
 from lslam.core.geometry import portable, se3
 from lslam.core.printable import first_of, printable
-from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.gnss import GnssStream
 from lslam.core.types.imu import ImuStream
 from lslam.core.types.scan import Scan

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Bools, Floats, Longs, Stamps
 from lslam.core.errors import InputError, UsageError
 from lslam.core.geometry import se3, so3
-from lslam.core.types.arrays import Bools, Floats, Longs, Stamps
 from lslam.core.types.scan import NO_RING, has_return
 from lslam.io.formats.bag_files import Bag, BagTopic, read_header
 from lslam.io.formats.bag_streams import Transforms, chain, is_static, read_transforms

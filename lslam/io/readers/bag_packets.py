@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Ints, Longs
 from lslam.core.errors import InputError
-from lslam.core.types.arrays import Longs
 from lslam.io.formats import velodyne_packets
 from lslam.io.formats.bag_files import Bag, BagTopic
 from lslam.io.formats.bag_streams import read_text
@@ -38,7 +38,7 @@ class BagPackets:
     stamps_ns: Longs
     sizes: Longs
     sources: Longs
-    places: NDArray[np.int32]
+    places: Ints
     positions: tuple[int, ...]
     heads: NDArray[np.uint8]
 

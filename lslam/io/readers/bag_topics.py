@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
+from lslam.core.arrays import Bools, Stamps
 from lslam.core.errors import InputError, LslamError, UsageError
-from lslam.core.types.arrays import Bools, Stamps
 from lslam.io.formats.bag_files import Bag, BagTopic, Header, read_header
 from lslam.io.formats.bag_listing import missing_parts
 from lslam.io.formats.bag_streams import Stream, read_fixes, read_imu

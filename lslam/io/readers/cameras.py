@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from lslam.core.arrays import Floats, Longs
 from lslam.core.errors import InputError
 from lslam.core.geometry import se3
-from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.camera import MODELS, Camera, Image, Lens
 from lslam.io.formats.bag_files import Bag, BagTopic, read_header
 from lslam.io.formats.image_files import SUFFIXES, decode_image, from_pixels, image_size, read_image

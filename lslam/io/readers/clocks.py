@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.core.types.arrays import Bools, Longs, Stamps
+from lslam.core.arrays import Bools, Longs, Stamps
 from lslam.io.readers.ground_truth import Voice
 
 # Median intervals of two clocks that both tell the time of the drive; beyond, one was played back at another speed.

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats, Longs
 from lslam.core.errors import InputError, input_errors
 from lslam.core.printable import printable
-from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.scan import Scan, Span
 from lslam.core.types.sequence import readable
 from lslam.core.types.trajectory import Trajectory
@@ -32,7 +32,6 @@ from lslam.io.readers.scan_stamps import rows_of_scans
 from lslam.io.readers.sequence_on_disk import SequenceOnDisk, in_metres, settle_unit
 from lslam.io.readers.sidecars import compensation_note, load_streams, per_point_folder, read_info, stated_times
 
-Matrix = NDArray[np.float64]
 _PER_POINT: dict[str, Any] = {"t": np.float32, "ring": np.uint16}
 _LOOKED_AT = 3
 
@@ -111,7 +110,7 @@ class Folder:
         """The points of a scan file."""
         return read_points(file, self.record)
 
-    def calibration(self, path: Path, read: Callable[[Path], Matrix | None]) -> Matrix | None:
+    def calibration(self, path: Path, read: Callable[[Path], Floats | None]) -> Floats | None:
         """Result of `read` on a calibration file; None, with a problem, where it cannot be read."""
         try:
             return read(path)

@@ -9,10 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lslam.core.arrays import Bools, Floats, Longs
 from lslam.core.errors import InputError
 from lslam.core.geometry import geodesy, portable, se3, so3
 from lslam.core.geometry.se3 import poses_at
-from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.core.types.sequence import Calibration
 from lslam.core.types.trajectory import Trajectory
 from lslam.core.untrusted import whole_number

@@ -5,9 +5,9 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
+from lslam.core.arrays import Floats, Longs
 from lslam.core.errors import InputError
 from lslam.core.printable import printable
-from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.sequence import Calibration
 from lslam.core.types.trajectory import Trajectory
 from lslam.io.formats.kitti_layout import read_odometry_calib

@@ -19,9 +19,9 @@ from typing import Any
 
 import numpy as np
 
+from lslam.core.arrays import Floats, Longs
 from lslam.core.errors import InputError, input_errors
 from lslam.core.geometry import geodesy, se3, so3
-from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.gnss import GnssStream
 from lslam.core.types.imu import ImuStream
 from lslam.core.types.sequence import Calibration, Sequence

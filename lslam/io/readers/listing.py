@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Longs, Stamps
 from lslam.core.errors import InputError, input_errors
-from lslam.core.types.arrays import Longs, Stamps
 from lslam.io.formats.point_files import SUFFIXES
 from lslam.io.formats.time_columns import read_stamps
 

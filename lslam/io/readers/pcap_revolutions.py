@@ -11,9 +11,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Bools, Floats, Longs
 from lslam.core.errors import InputError
 from lslam.core.geometry import se3
-from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.core.types.imu import ImuStream
 from lslam.core.types.scan import Scan
 from lslam.io.formats.ouster_packets import IMU_SIZE, OusterSensor, frames_and_times, imu_of, read_metadata

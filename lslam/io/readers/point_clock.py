@@ -11,8 +11,8 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Bools, Longs, Stamps
 from lslam.core.errors import InputError
-from lslam.core.types.arrays import Bools, Longs, Stamps
 from lslam.core.types.scan import has_return
 from lslam.core.types.sequence import readable
 from lslam.io.formats.point_cloud import PointCloud

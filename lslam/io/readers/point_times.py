@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Bools
 from lslam.core.errors import InputError
-from lslam.core.types.arrays import Bools
 from lslam.core.types.scan import Span, has_return
 from lslam.io.formats.point_cloud import PointCloud, TimeColumn
 from lslam.io.formats.time_columns import UNITS

@@ -8,7 +8,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from lslam.core.types.arrays import Floats, Longs
+from lslam.core.arrays import Floats, Longs
 from lslam.core.types.gnss import GnssStream
 from lslam.core.types.imu import ImuStream
 from lslam.core.types.sequence import Calibration

@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from lslam.core.arrays import Longs, Stamps
 from lslam.core.errors import InputError
-from lslam.core.types.arrays import Longs, Stamps
 from lslam.core.untrusted import whole_number
 from lslam.io.formats.point_cloud import PointCloud
 from lslam.io.formats.text_tables import read_rows

@@ -12,8 +12,8 @@ from typing import TypeVar
 
 import numpy as np
 
+from lslam.core.arrays import Floats, Longs
 from lslam.core.errors import InputError
-from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.camera import Camera
 from lslam.core.types.gnss import GnssStream
 from lslam.core.types.imu import ImuStream

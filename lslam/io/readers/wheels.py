@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
+from lslam.core.arrays import Floats, Longs
 from lslam.core.errors import InputError
 from lslam.core.geometry import se3, so3
-from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.imu import WheelStream
 from lslam.core.types.sequence import Sequence
 from lslam.io.formats.bag_files import Bag

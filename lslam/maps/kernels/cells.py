@@ -18,6 +18,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats, Ints
 from lslam.core.kernels.jit import inline, kernel
 from lslam.core.kernels.voxel import BLOCK
 
@@ -49,7 +50,7 @@ def slot_of(key: int, mask: int) -> int:
 
 
 @inline
-def row_of(key: int, slots: NDArray[np.int32], rows: NDArray[np.int64], row_count: int) -> int:
+def row_of(key: int, slots: Ints, rows: NDArray[np.int64], row_count: int) -> int:
     """Row of a key.
 
     A new key is entered in `slots` and gets row number `row_count`, in which only the key is set.
@@ -70,7 +71,7 @@ def row_of(key: int, slots: NDArray[np.int32], rows: NDArray[np.int64], row_coun
 
 
 @kernel
-def enter(slots: NDArray[np.int32], rows: NDArray[np.int64], row_count: int) -> None:
+def enter(slots: Ints, rows: NDArray[np.int64], row_count: int) -> None:
     """Enter the first `row_count` rows into `slots`, all -1 before; the number of slots is a power of two above `row_count`."""
     mask = slots.shape[0] - 1
     for row in range(row_count):
@@ -93,11 +94,11 @@ def sum_up(
     points: NDArray[np.float32],
     intensity: NDArray[np.float32],
     tags: NDArray[np.int64],
-    T: NDArray[np.float64],
+    T: Floats,
     range_min: float,
     range_max: float,
     voxel: float,
-    crop: NDArray[np.float64],
+    crop: Floats,
     origin: NDArray[np.int64],
     rows: NDArray[np.int64],
 ) -> tuple[int, int, int]:
@@ -178,9 +179,7 @@ def sum_up(
 
 
 @kernel
-def add_rows(
-    more: NDArray[np.int64], has_tags: bool, slots: NDArray[np.int32], rows: NDArray[np.int64], row_count: int
-) -> int:
+def add_rows(more: NDArray[np.int64], has_tags: bool, slots: Ints, rows: NDArray[np.int64], row_count: int) -> int:
     """Add rows (M, k) to those of the same voxels; returns the rows used now.
 
     slots : (S,) row of each hash slot or -1, S a power of two above used + M; rows : (R, k), R >= used + M
@@ -216,7 +215,7 @@ def add_rows(
 
 
 @kernel
-def unpack(rows: NDArray[np.int64], origin: NDArray[np.int64], voxel: float) -> NDArray[np.float64]:
+def unpack(rows: NDArray[np.int64], origin: NDArray[np.int64], voxel: float) -> Floats:
     """(M, 3) float64 mean positions, m, of finished rows (M, 5 or more).
 
     origin : (3,) cell in the middle of the key range; voxel : edge of a cell, m
@@ -231,7 +230,7 @@ def unpack(rows: NDArray[np.int64], origin: NDArray[np.int64], voxel: float) -> 
 
 
 @inline
-def _seen_row(key: int, slots: NDArray[np.int32], rows: NDArray[np.int64], row_count: int) -> int:
+def _seen_row(key: int, slots: Ints, rows: NDArray[np.int64], row_count: int) -> int:
     """Row of a key; for a new key the new row number `row_count`, without any update."""
     row = row_of(key, slots, rows, row_count)
     if row == row_count:
@@ -252,17 +251,17 @@ def _update(rows: NDArray[np.int64], row: int, change: int, low: int, high: int)
 @kernel
 def mark_ends(
     points: NDArray[np.float32],
-    T: NDArray[np.float64],
+    T: Floats,
     range_min: float,
     range_max: float,
     voxel: float,
     origin: NDArray[np.int64],
-    slots: NDArray[np.int32],
+    slots: Ints,
     rows: NDArray[np.int64],
     row_count: int,
     stamp: int,
     model: NDArray[np.int64],
-) -> tuple[int, NDArray[np.float64]]:
+) -> tuple[int, Floats]:
     """Update the cells in which beams end, once each; returns the rows used now, and the ends (E, 3) of the beams, in cells.
 
     points : (N, 3) sensor frame, m; T : (4, 4) world from sensor; origin : (3,) cell in the middle of the key range
@@ -307,12 +306,12 @@ def mark_ends(
 
 @kernel
 def carve(
-    ends: NDArray[np.float64],
+    ends: Floats,
     begin: int,
-    start: NDArray[np.float64],
+    start: Floats,
     longest: int,
     origin: NDArray[np.int64],
-    slots: NDArray[np.int32],
+    slots: Ints,
     rows: NDArray[np.int64],
     row_count: int,
     stamp: int,

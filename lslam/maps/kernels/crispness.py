@@ -7,6 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats
 from lslam.core.kernels.jit import inline, kernel
 from lslam.core.kernels.linalg import eigen, extent
 from lslam.core.kernels.voxel import pack
@@ -30,12 +31,12 @@ def _below(keys: NDArray[np.int64], key: int) -> int:
 
 @inline
 def moments(
-    points: NDArray[np.float64],
+    points: Floats,
     keys: NDArray[np.int64],
-    query: NDArray[np.float64],
-    low: NDArray[np.float64],
+    query: Floats,
+    low: Floats,
     radius: float,
-    matrix: NDArray[np.float64],
+    matrix: Floats,
 ) -> int:
     """Number of points within `radius`, m, of a query (3,); writes their scatter about their mean, m2, into `matrix` (3, 3).
 
@@ -78,7 +79,7 @@ def moments(
 
 
 @kernel
-def cell_keys(points: NDArray[np.float64], low: NDArray[np.float64], size: float) -> NDArray[np.int64]:
+def cell_keys(points: Floats, low: Floats, size: float) -> NDArray[np.int64]:
     """(N,) packed cell of each point, z fastest, cells of edge `size`, m, counted from `low` (3,), m, below all points."""
     keys = np.empty(len(points), np.int64)
     for i in range(len(points)):
@@ -92,13 +93,13 @@ def cell_keys(points: NDArray[np.float64], low: NDArray[np.float64], size: float
 
 @kernel
 def shapes(
-    points: NDArray[np.float64],
+    points: Floats,
     keys: NDArray[np.int64],
-    queries: NDArray[np.float64],
-    low: NDArray[np.float64],
+    queries: Floats,
+    low: Floats,
     radius: float,
     least: int,
-) -> NDArray[np.float64]:
+) -> Floats:
     """Entropy, nats, and plane variance, m2, (Q, 2) of the points within `radius`, m, of each query.
 
     NaN where they are fewer than `least`.
@@ -124,13 +125,13 @@ def shapes(
 
 @kernel
 def normals(
-    points: NDArray[np.float64],
+    points: Floats,
     keys: NDArray[np.int64],
-    queries: NDArray[np.float64],
-    low: NDArray[np.float64],
+    queries: Floats,
+    low: Floats,
     radius: float,
     least: int,
-) -> NDArray[np.float64]:
+) -> Floats:
     """Unit normals (Q, 3) of the planes through the points within `radius`, m, of each query, of either sign.
 
     Zero where these are fewer than `least`; points as in `shapes`.

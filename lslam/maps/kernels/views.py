@@ -12,13 +12,14 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Bools, Floats, Ints
 from lslam.core.kernels.jit import inline, kernel
 
 _MIX_A, _MIX_B = -4658895280553007687, -7723592293110705685  # of splitmix64, as int64
 
 
 @inline
-def project(x: float, y: float, z: float, lens: NDArray[np.float64]) -> tuple[float, float]:
+def project(x: float, y: float, z: float, lens: Floats) -> tuple[float, float]:
     """Pixel of a point of the camera's frame, m; NaN where the lens does not see: behind it, or where its model folds back."""
     flat = np.sqrt(x * x + y * y)
     if lens[0] > 0.5:
@@ -41,7 +42,7 @@ def project(x: float, y: float, z: float, lens: NDArray[np.float64]) -> tuple[fl
 
 
 @kernel
-def project_all(points: NDArray[np.float64], lens: NDArray[np.float64], pixels: NDArray[np.float64]) -> None:
+def project_all(points: Floats, lens: Floats, pixels: Floats) -> None:
     """Write the pixels (N, 2) of points (N, 3) of the camera's frame, m; NaN where the lens does not see."""
     for i in range(len(points)):
         u, v = project(points[i, 0], points[i, 1], points[i, 2], lens)
@@ -49,9 +50,7 @@ def project_all(points: NDArray[np.float64], lens: NDArray[np.float64], pixels: 
 
 
 @kernel
-def shifted_means(
-    image: NDArray[np.float32], pixels: NDArray[np.float64], weights: NDArray[np.float64], means: NDArray[np.float64]
-) -> None:
+def shifted_means(image: NDArray[np.float32], pixels: Floats, weights: Floats, means: Floats) -> None:
     """Write the weighted mean of the image over pixels (N, 2) moved by each shift into `means` (2R+1, 2R+1), rows and columns.
 
     Pixels that some shift moves out of the image are left out of all; zeros where none is left.
@@ -85,9 +84,7 @@ def _share(point: int, view: int) -> float:
 
 
 @inline
-def _seen_from(
-    points: NDArray[np.float32], i: int, T: NDArray[np.float64], lens: NDArray[np.float64]
-) -> tuple[float, float, float]:
+def _seen_from(points: NDArray[np.float32], i: int, T: Floats, lens: Floats) -> tuple[float, float, float]:
     """Pixel and range, m, of point i; NaN where the lens does not see it."""
     px, py, pz = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
     x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
@@ -98,9 +95,7 @@ def _seen_from(
 
 
 @inline
-def _cosine(
-    points: NDArray[np.float32], normals: NDArray[np.int8], i: int, T: NDArray[np.float64], far: float
-) -> float:
+def _cosine(points: NDArray[np.float32], normals: NDArray[np.int8], i: int, T: Floats, far: float) -> float:
     """Cosine between the normal of point i, in 127ths, and the ray to it; 1 where the normal is unknown, 0."""
     nx, ny, nz = normals[i, 0] / 127.0, normals[i, 1] / 127.0, normals[i, 2] / 127.0
     if not nx * nx + ny * ny + nz * nz > 0.0:
@@ -123,7 +118,7 @@ def _is_gone(
     points: NDArray[np.float32],
     normals: NDArray[np.int8],
     i: int,
-    T: NDArray[np.float64],
+    T: Floats,
     spacing: float,
     u: float,
     v: float,
@@ -145,8 +140,8 @@ def splat(
     points: NDArray[np.float32],
     normals: NDArray[np.int8],
     runs: NDArray[np.int64],
-    T: NDArray[np.float64],
-    lens: NDArray[np.float64],
+    T: Floats,
+    lens: Floats,
     spacing: float,
     reach: float,
     behind: NDArray[np.float32],
@@ -184,8 +179,8 @@ def collect(
     points: NDArray[np.float32],
     normals: NDArray[np.int8],
     runs: NDArray[np.int64],
-    T: NDArray[np.float64],
-    lens: NDArray[np.float64],
+    T: Floats,
+    lens: Floats,
     spacing: float,
     reach: float,
     behind: NDArray[np.float32],
@@ -194,7 +189,7 @@ def collect(
     view: int,
     weight: float,
     ranks: NDArray[np.float32],
-    views: NDArray[np.int32],
+    views: Ints,
     colours: NDArray[np.uint8],
 ) -> int:
     """Enter the colour of every point that the image shows into the views kept of it. Returns the number of such points.
@@ -241,9 +236,9 @@ def collect(
 @kernel
 def medians(
     ranks: NDArray[np.float32],
-    views: NDArray[np.int32],
+    views: Ints,
     colours: NDArray[np.uint8],
-    gains: NDArray[np.float64],
+    gains: Floats,
     out: NDArray[np.uint8],
 ) -> int:
     """Write the vector median (Astola et al. 1990) of the views of each point into `out` (N, 3); returns how many have none.
@@ -291,7 +286,7 @@ def _pixel(x: float, y: float, z: float, low: float, inverse: float, columns: in
 
 @kernel
 def nearest_ranges(
-    points: NDArray[np.float32], stands: NDArray[np.bool_], rows: int, columns: int, low: float, inverse: float
+    points: NDArray[np.float32], stands: Bools, rows: int, columns: int, low: float, inverse: float
 ) -> NDArray[np.float32]:
     """Range image (rows, columns, 3) of points (N, 3), sensor frame: range, height and clear range of each pixel, m.
 
@@ -336,7 +331,7 @@ def _clear(image: NDArray[np.float32], row: int, column: int) -> np.float32:
 @kernel
 def vote(
     points: NDArray[np.float32],
-    T: NDArray[np.float64],
+    T: Floats,
     image: NDArray[np.float32],
     low: float,
     inverse: float,

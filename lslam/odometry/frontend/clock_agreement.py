@@ -9,12 +9,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from lslam.core.arrays import Floats, Longs
 from lslam.core.config import Config
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.config.odometry import RecoveryConfig
 from lslam.core.errors import InputError
 from lslam.core.geometry import se3, so3
-from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
 from lslam.core.types.sequence import Sequence

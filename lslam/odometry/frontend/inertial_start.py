@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
+from lslam.core.arrays import Floats, Longs
 from lslam.core.config import Config
 from lslam.core.config.odometry import TIGHTLY_COUPLED
 from lslam.core.errors import InputError
-from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.imu import ImuStream
 from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.sequence import Selection, Sequence, select

@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.backend.keyframes.store import KeyframeStore
+from lslam.core.arrays import Floats, Longs
 from lslam.core.config import Config
 from lslam.core.config.backend import KeyframesConfig
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.geometry import se3, so3
 from lslam.core.kernels import voxel
-from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import ScanResult

@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
+from lslam.core.arrays import Floats
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.errors import InputError
 from lslam.core.geometry import se3
 from lslam.core.geometry.se3 import poses_at
-from lslam.core.types.arrays import Floats
 from lslam.core.types.scan import FARTHEST_M, Scan, Span
 from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.sequence import Selection, Sequence

@@ -9,10 +9,10 @@ from itertools import islice
 
 import numpy as np
 
+from lslam.core.arrays import Floats
 from lslam.core.config import Config
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.errors import InputError
-from lslam.core.types.arrays import Floats
 from lslam.core.types.imu import ImuStream
 from lslam.core.types.sequence import Sequence, readable
 from lslam.odometry.inertial.imu_cleaning import gravity_unit

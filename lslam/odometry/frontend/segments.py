@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+from lslam.core.arrays import Floats
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.geometry import se3
-from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.state import State, Stateful

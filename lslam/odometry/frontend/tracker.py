@@ -9,8 +9,8 @@ from typing import Any, cast
 
 import numpy as np
 
+from lslam.core.arrays import Floats
 from lslam.core.geometry import se3, so3
-from lslam.core.types.arrays import Floats
 from lslam.core.types.imu import ImuDiagnostics
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import LEVER_M, Scan, Span

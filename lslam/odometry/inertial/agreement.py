@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lslam.core.arrays import Floats, Longs
 from lslam.core.geometry import so3
-from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.imu import ImuStream
 from lslam.odometry.inertial.imu_cleaning import ImuFault, ImuRefusedError
 

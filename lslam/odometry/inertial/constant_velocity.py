@@ -10,8 +10,8 @@ from typing import ClassVar, Protocol
 
 import numpy as np
 
+from lslam.core.arrays import Floats, Longs
 from lslam.core.geometry import se3
-from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.imu import GravityDirection, ImuState
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Span

@@ -10,11 +10,10 @@ from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lslam.core.arrays import Bools, Floats
 from lslam.core.geometry import noise, se3, so3
 from lslam.core.kernels import linalg
-from lslam.core.types.arrays import Floats
 from lslam.core.types.imu import GRAVITY
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Span
@@ -107,7 +106,7 @@ class Normal:
         """(N,) the update to the minimum; NaN where H is not positive definite."""
         return -linalg.solve(self.H, self.g)
 
-    def without(self, out: NDArray[np.bool_]) -> Normal:
+    def without(self, out: Bools) -> Normal:
         """Marginalise the variables marked in `out` (N,) by the Schur complement."""
         if not out.any():
             return self

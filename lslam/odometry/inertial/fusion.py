@@ -8,9 +8,9 @@ from typing import ClassVar
 
 import numpy as np
 
+from lslam.core.arrays import Floats
 from lslam.core.config import Config
 from lslam.core.geometry import se3
-from lslam.core.types.arrays import Floats
 from lslam.core.types.imu import GRAVITY, GravityDirection, ImuState, ImuStream
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import LEVER_M, Span

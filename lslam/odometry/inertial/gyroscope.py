@@ -12,9 +12,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from lslam.core.arrays import Floats
 from lslam.core.config.odometry import ImuConfig
 from lslam.core.geometry import so3
-from lslam.core.types.arrays import Floats
 from lslam.odometry.inertial.integrate import Increments
 from lslam.odometry.kernels import kalman
 

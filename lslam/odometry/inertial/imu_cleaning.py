@@ -10,7 +10,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from lslam.core.types.arrays import Bools, Floats, Longs
+from lslam.core.arrays import Bools, Floats, Longs
 from lslam.core.types.imu import GRAVITY, ImuStream, WheelStream
 from lslam.odometry.kernels.strapdown import overlaps
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from lslam.core.types.arrays import Floats, Longs
+from lslam.core.arrays import Floats, Longs
 from lslam.core.types.imu import GRAVITY, ImuState, ImuStream
 from lslam.core.types.scan import LEVER_M
 from lslam.core.types.state import State, Stateful

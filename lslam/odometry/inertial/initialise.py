@@ -7,9 +7,9 @@ from itertools import pairwise
 
 import numpy as np
 
+from lslam.core.arrays import Floats, Longs
 from lslam.core.config.odometry import ImuConfig
 from lslam.core.kernels.linearisation import OUTLIER_SIGMAS
-from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.imu import GRAVITY, ImuStream
 from lslam.core.types.scan import LEVER_M
 from lslam.core.types.scan_result import FASTEST_M_S, STILL_M

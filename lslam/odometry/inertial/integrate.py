@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lslam.core.types.arrays import Floats, Longs
+from lslam.core.arrays import Floats, Longs
 from lslam.core.types.imu import ImuStream
 from lslam.odometry.kernels import strapdown
 

@@ -10,10 +10,10 @@ from typing import ClassVar
 import numpy as np
 
 from lslam.backend.graph.inertial_smoother import InertialSmoother
+from lslam.core.arrays import Floats
 from lslam.core.config import Config
 from lslam.core.errors import GraphError
 from lslam.core.geometry import noise, se3
-from lslam.core.types.arrays import Floats
 from lslam.core.types.imu import InertialChain, InertialLink, InertialState, InertialStep, SmootherNoise
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Span

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from lslam.core.arrays import Floats
 from lslam.core.geometry import se3, so3
-from lslam.core.types.arrays import Floats
 from lslam.core.types.imu import WheelStream
 from lslam.odometry.inertial.gyroscope import INNOVATION_SIGMAS, NOISE_MEMORY_SCANS, OFFSET_SIGMA
 from lslam.odometry.kernels import kalman

@@ -7,9 +7,9 @@ from itertools import pairwise
 
 import numpy as np
 
+from lslam.core.arrays import Bools, Floats, Longs
 from lslam.core.geometry import se3
 from lslam.core.kernels.linearisation import OUTLIER_SIGMAS
-from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.core.types.scan_result import MOST_ACCELERATION_M_S2, OPEN_M, OPEN_RAD, SAME_M, USUAL, MotionCheck
 from lslam.odometry.integrity.pair_registration import EMPTIED_SHARE, MORE_POINTS_RATIO, is_within
 

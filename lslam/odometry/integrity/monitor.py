@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lslam.core.arrays import Floats, Longs
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.geometry import se3
-from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.imu import GRAVITY
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan

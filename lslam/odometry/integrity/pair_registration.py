@@ -12,10 +12,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Bools, Floats, Longs
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.geometry import se3
 from lslam.core.kernels.linearisation import OUTLIER_SIGMAS
-from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.core.types.scan import LEVER_M
 from lslam.core.types.scan_result import SAME_M, motion_apart
 from lslam.registration.alignment import voxel_terms

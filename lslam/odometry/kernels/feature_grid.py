@@ -10,16 +10,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats, Ints, Longs, Rings
 from lslam.core.kernels.gaussians import find
 from lslam.core.kernels.jit import inline, kernel
 from lslam.core.kernels.voxel import OFFSET, index_of, pack, place_of, table_size
 
-Floats = NDArray[np.float64]
-Longs = NDArray[np.int64]
-Ints = NDArray[np.int32]
-Rings = NDArray[np.uint16]
 # Indices of the counterparts of each point (S, 3); for each where the point was, world, m, and the squared distance, m2, within
 # which it stays the same (S, 3, 4).
 Matches = tuple[Ints, Floats]

@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats, Ints, Longs, Rings
 from lslam.core.kernels.gaussians import find
 from lslam.core.kernels.jit import inline, kernel
 from lslam.core.kernels.linearisation import INLIERS, MATCHED, Pose, Sums, Width
@@ -20,10 +20,6 @@ from lslam.core.kernels.voxel import index_of, pack
 from lslam.odometry.kernels.feature_grid import Matches, counterparts
 from lslam.odometry.kernels.lines import add_line
 
-Floats = NDArray[np.float64]
-Longs = NDArray[np.int64]
-Ints = NDArray[np.int32]
-Rings = NDArray[np.uint16]
 # A grid, see `feature_grid`; a grid with the normal of the surface around each point; and the size of its cells, m, the
 # largest distance of a counterpart, m, the variance of a point, m2, and whether counterparts are joined to lines and planes.
 Grid = tuple[Floats, Rings, Ints, Longs, Ints]

@@ -5,12 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats
 from lslam.core.kernels.jit import kernel
 from lslam.odometry.kernels.rotation import exponential, logarithm, multiply, straighten
-
-Floats = NDArray[np.float64]
 
 
 @kernel

@@ -10,18 +10,13 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-from numpy.typing import NDArray
-
+from lslam.core.arrays import Floats, Ints, Longs
 from lslam.core.kernels.jit import inline, kernel
 from lslam.core.kernels.linalg import plane_of
 from lslam.core.kernels.linearisation import INLIERS, MATCHED, Pose, Sums, Width
 from lslam.core.kernels.residuals import TILT_FACTOR, add_facts, add_row, octant_slots, place
 from lslam.core.kernels.voxel import MASK, OFFSET
 
-Floats = NDArray[np.float64]
-Longs = NDArray[np.int64]
-Ints = NDArray[np.int32]
 # Moments, keys and table of a voxel pool, see `gaussians`; rows of lines, and the keys and sums they were computed at.
 LineVoxels = tuple[Floats, Longs, Ints, Floats, Longs, Floats]
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats
 from lslam.core.kernels.jit import inline, kernel
 from lslam.odometry.kernels.rotation import exponential, multiply, straighten
-
-Floats = NDArray[np.float64]
 
 
 @kernel

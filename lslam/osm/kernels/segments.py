@@ -10,13 +10,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats, Ints, Longs
 from lslam.core.kernels.jit import inline, kernel
 from lslam.core.kernels.linalg import plane_of
 from lslam.core.kernels.voxel import index_of, pack, place_of, table_size
-
-Floats = NDArray[np.float64]
-Longs = NDArray[np.int64]
-Ints = NDArray[np.int32]
 
 
 @inline

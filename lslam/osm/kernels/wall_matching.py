@@ -9,14 +9,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats, Longs
 from lslam.core.kernels.jit import inline, inline_with_arrays, kernel
 
 STAYS, STAYS_RAD = 0.002, 0.0001  # m and rad; a smaller step ends the iteration: far below the accuracy of a map
-
-Floats = NDArray[np.float64]
-Longs = NDArray[np.int64]
 
 
 @inline

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats, Longs
 from lslam.core.errors import OutputError, UsageError, cause, output_errors
 from lslam.core.geometry import so3
-from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.scan import Scan
 from lslam.io.formats.bag_files import INFO_TOPIC, typestore
 from lslam.io.formats.sensor_messages import TYPES

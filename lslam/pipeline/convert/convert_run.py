@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats
 from lslam.core.errors import InputError, UsageError
 from lslam.core.kernels.voxel import first_points
-from lslam.core.types.arrays import Floats
 from lslam.core.types.sequence import Sequence
 from lslam.maps.clean import PosedScan
 from lslam.odometry.frontend.register_scans import read_ahead

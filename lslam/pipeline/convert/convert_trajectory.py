@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from lslam.core import __version__
+from lslam.core.arrays import Floats
 from lslam.core.errors import InputError, UsageError
 from lslam.core.extras import importing, install_hint
 from lslam.core.geometry import se3
@@ -134,9 +135,9 @@ def change_frame(trajectory: Trajectory, frame: str, calibration: Calibration) -
     return replace(trajectory, poses=se3.normalise(poses), frame=frame, covariances=None)
 
 
-def _require_extrinsic(calibration: Calibration, name: str, trajectory: Trajectory, frame: str) -> se3.Floats:
+def _require_extrinsic(calibration: Calibration, name: str, trajectory: Trajectory, frame: str) -> Floats:
     """Extrinsic `name` (4, 4), m. Raises InputError with the option that gives it when it is unknown."""
-    T: se3.Floats | None = getattr(calibration, name)
+    T: Floats | None = getattr(calibration, name)
     if T is None:
         flag = (
             "--calib (a KITTI calib.txt with Tr)" if name == "T_cam0_lidar" else "--extrinsics (the IMU in the LiDAR)"

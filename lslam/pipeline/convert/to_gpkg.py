@@ -12,9 +12,9 @@ from xml.etree.ElementTree import Element, SubElement, tostring
 
 import numpy as np
 
+from lslam.core.arrays import Floats
 from lslam.core.errors import InputError, OutputError, UsageError, cause
 from lslam.core.extras import importing, install_hint
-from lslam.core.types.arrays import Floats
 from lslam.core.types.gnss import OutputCrs
 from lslam.io.formats.text_tables import utc_of
 from lslam.maps.georeference import LocalFrame, Projection, in_crs

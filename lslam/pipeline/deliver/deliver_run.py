@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.core import __version__
+from lslam.core.arrays import Floats
 from lslam.core.errors import InputError, OutputExistsError, UsageError, input_errors
 from lslam.core.extras import install_command
 from lslam.core.geometry import so3
 from lslam.core.printable import count_of
-from lslam.core.types.arrays import Floats
 from lslam.core.untrusted import MISFIT
 from lslam.io.formats.atomic import atomic_write, write_text
 from lslam.io.formats.image_files import write_geotiff

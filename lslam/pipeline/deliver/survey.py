@@ -15,10 +15,10 @@ import numpy as np
 from lslam.backend.control_points import control_residuals
 from lslam.backend.manual import read_control_points, require_instants
 from lslam.core import __version__
+from lslam.core.arrays import Floats
 from lslam.core.errors import InputError, RunFailedError, UsageError, input_errors
 from lslam.core.geometry import geodesy, noise, se3
 from lslam.core.printable import count_of, first_of, with_decimals
-from lslam.core.types.arrays import Floats
 from lslam.core.types.gnss import OutputCrs
 from lslam.core.untrusted import MISFIT
 from lslam.io.formats.text_tables import utc_of

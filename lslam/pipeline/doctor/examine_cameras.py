@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats, Longs
 from lslam.core.config import Config
 from lslam.core.errors import InputError
 from lslam.core.geometry import portable, se3
 from lslam.core.geometry.se3 import ContinuousMotion
 from lslam.core.printable import count_of
-from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.camera import Camera, Image, cameras_of
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan

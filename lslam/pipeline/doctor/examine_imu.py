@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lslam.core.arrays import Floats
 from lslam.core.printable import count_of
-from lslam.core.types.arrays import Floats
 from lslam.core.types.imu import GRAVITY, ImuStream
 from lslam.core.types.sequence import Sequence, no_shared_time
 from lslam.odometry.inertial.imu_cleaning import LEAST_RATE_HZ, gravity_unit, is_slow, mean_forces, rate_of

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from lslam.core.arrays import Floats, Longs, Stamps
 from lslam.core.geometry.geodesy import to_local
 from lslam.core.printable import count_of
-from lslam.core.types.arrays import Floats, Longs, Stamps
 from lslam.core.types.scan import Span
 from lslam.core.types.sequence import Sequence, no_shared_time
 from lslam.core.types.trajectory import Trajectory

@@ -8,9 +8,9 @@ from itertools import permutations, product
 
 import numpy as np
 
+from lslam.core.arrays import Bools, Floats, Longs
 from lslam.core.config import Config
 from lslam.core.geometry import so3
-from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.core.types.imu import ImuStream
 from lslam.core.types.sequence import Sequence
 from lslam.odometry.frontend.inertial_start import first_poses

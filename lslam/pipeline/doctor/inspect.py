@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Longs
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.errors import InputError, LslamError
 from lslam.core.printable import count_of
-from lslam.core.types.arrays import Longs
 from lslam.core.types.scan import FARTHEST_M, NO_RING, Scan, Span
 from lslam.core.types.sequence import Sequence
 from lslam.core.types.trajectory import Trajectory

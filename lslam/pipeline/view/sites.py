@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
+from lslam.core.arrays import Floats
 from lslam.core.errors import (
     InputError,
     InterruptedRunError,
@@ -33,7 +34,6 @@ from lslam.core.errors import (
 )
 from lslam.core.geometry import se3
 from lslam.core.kernels.cache import cache_folder
-from lslam.core.types.arrays import Floats
 from lslam.core.types.cloud import thin_out
 from lslam.core.types.trajectory import Trajectory
 from lslam.core.untrusted import parse_json

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Bools, Floats
 from lslam.core.kernels.jit import kernel
 
 SIDE_POINTS = 5  # neighbours on each side
@@ -48,7 +49,7 @@ def into_rings(
 @kernel
 def walk(
     points: NDArray[np.float32], order: NDArray[np.int64], starts: NDArray[np.int64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], float, float, float]:
+) -> tuple[Floats, Floats, Floats, float, float, float]:
     """Walk along every ring.
 
     Returns the points in order (K, 3), their ranges (K,), m, and the angle to the next point of the ring (K,), rad, inf
@@ -101,15 +102,15 @@ def walk(
 
 @kernel
 def curvatures(
-    xyz: NDArray[np.float64],
-    ranges: NDArray[np.float64],
-    steps: NDArray[np.float64],
+    xyz: Floats,
+    ranges: Floats,
+    steps: Floats,
     starts: NDArray[np.int64],
     gap: float,
     jump: float,
     jump_slope: float,
     parallel_slope: float,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+) -> tuple[Floats, Floats, Bools]:
     """Curvature (K,) of equation 2.21, the part of it that is a bend (K,), and the breaks of the rings (K,).
 
     The curvature is NaN where a ring ends or has a gap within `SIDE_POINTS` points. It is NaN as well on the far side of an
@@ -177,10 +178,10 @@ def curvatures(
 
 @kernel
 def pick(
-    curvature: NDArray[np.float64],
-    bend: NDArray[np.float64],
-    ranges: NDArray[np.float64],
-    breaks: NDArray[np.bool_],
+    curvature: Floats,
+    bend: Floats,
+    ranges: Floats,
+    breaks: Bools,
     may_be: NDArray[np.uint8],
     starts: NDArray[np.int64],
     regions: int,
@@ -250,12 +251,12 @@ def pick(
 
 @kernel
 def thin(
-    xyz: NDArray[np.float64],
+    xyz: Floats,
     at: NDArray[np.int64],
     rings: NDArray[np.uint16],
     times: NDArray[np.float32],
     size: float,
-) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float32]]:
+) -> tuple[Floats, NDArray[np.int64], NDArray[np.float32]]:
     """One centroid for each run of points `at` (M,), of `xyz` (K, 3), along a ring within one cell of a grid of `size` m.
 
     Returns the centroids (C, 3), the first point of each run (C,) and the mean times (C,), or (0,) where `times` is (0,).

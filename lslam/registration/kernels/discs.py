@@ -5,16 +5,10 @@ A point may have several matches: what it may match stands first among its slots
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
+from lslam.core.arrays import Floats, Ints, Longs
 from lslam.core.kernels.gaussians import find
 from lslam.core.kernels.jit import inline, kernel
 from lslam.core.kernels.voxel import index_of, pack
-
-Floats = NDArray[np.float64]
-Longs = NDArray[np.int64]
-Ints = NDArray[np.int32]
 
 # m2 in the plane of a disc. Segal et al. (2009) take 1 m2, and about 1e-3 m2, our sigma2, across.
 EXTENT_M2 = 1.0

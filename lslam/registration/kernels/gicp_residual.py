@@ -6,8 +6,8 @@ The former takes the nearest Gaussian, the latter (Koide et al. 2021, section IV
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats, Ints, Longs
 from lslam.core.kernels.gaussians import BLOB, EMPTY
 from lslam.core.kernels.jit import inline, kernel
 from lslam.core.kernels.linalg import add_gradient, add_matrix, invert_symmetric, rotate_symmetric
@@ -37,10 +37,6 @@ from lslam.core.kernels.residuals import (
     variance_of,
 )
 from lslam.registration.kernels.discs import EXTENT_M2, disc, keep
-
-Floats = NDArray[np.float64]
-Longs = NDArray[np.int64]
-Ints = NDArray[np.int32]
 
 
 @inline

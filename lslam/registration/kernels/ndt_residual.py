@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-from numpy.typing import NDArray
-
+from lslam.core.arrays import Floats, Longs
 from lslam.core.kernels.gaussians import BLOB, FREE
 from lslam.core.kernels.jit import inline, kernel
 from lslam.core.kernels.linalg import add_gradient, add_matrix, invert_symmetric, plane_of
@@ -25,10 +23,6 @@ from lslam.core.kernels.linearisation import (
 )
 from lslam.core.kernels.residuals import Voxels, octant_slots, place
 from lslam.registration.kernels.discs import disc, keep
-
-Floats = NDArray[np.float64]
-Longs = NDArray[np.int64]
-Ints = NDArray[np.int32]
 
 # Eigenvalues below this share of the largest are raised to it (Magnusson, section 6.2.1).
 SMALLEST_SHARE = 0.01

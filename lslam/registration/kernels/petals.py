@@ -11,9 +11,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Bools, Floats
 from lslam.core.kernels.jit import kernel
-
-Floats = NDArray[np.float64]
 
 PETAL_SIDE = 2  # neighbours on each side
 
@@ -62,12 +61,12 @@ def smoothness(
     xyz: Floats,
     ranges: Floats,
     starts: NDArray[np.int64],
-    left_out: NDArray[np.bool_],
+    left_out: Bools,
     brightness: Floats,
     jump: float,
     jump_slope: float,
     grazing: float,
-) -> tuple[Floats, Floats, Floats, NDArray[np.bool_]]:
+) -> tuple[Floats, Floats, Floats, Bools]:
     """Curvature (K,) over `PETAL_SIDE` neighbours on each side, its bend, the contrast and the breaks of the lines, each (K,).
 
     The curvature is NaN for points that are no features: those that are `left_out`, within `PETAL_SIDE` points of a line's end,

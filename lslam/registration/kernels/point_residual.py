@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
+from lslam.core.arrays import Floats
 from lslam.core.kernels.gaussians import BLOB
 from lslam.core.kernels.jit import kernel
 from lslam.core.kernels.linearisation import INLIERS, MATCHED, Pose, Search, Settings, Sums, Width
 from lslam.core.kernels.residuals import Voxels, add_facts, add_information, octant_slots, place
-
-Floats = NDArray[np.float64]
 
 
 @kernel

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats
 from lslam.core.kernels.jit import kernel
 from lslam.core.kernels.linearisation import MATCHED, POPULATION, Pose, Sums, Width
-
-Floats = NDArray[np.float64]
 
 
 @kernel

@@ -8,13 +8,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Bools, Floats, Ints
 from lslam.core.kernels.jit import inline, kernel
 
 _REACH = 2  # pixels without a return that neighbours may have between them
 
 
 @kernel
-def row_slopes(points: NDArray[np.float64], starts: NDArray[np.int64]) -> NDArray[np.float64]:
+def row_slopes(points: Floats, starts: NDArray[np.int64]) -> Floats:
     """Mean tangent of elevation (rings,) of points (K, 3) in ring order, NaN for rings without points."""
     slopes = np.full(starts.shape[0] - 1, np.nan)
     for k in range(slopes.shape[0]):
@@ -28,8 +29,8 @@ def row_slopes(points: NDArray[np.float64], starts: NDArray[np.int64]) -> NDArra
 
 @kernel
 def project(
-    points: NDArray[np.float64],
-    ranges: NDArray[np.float64],
+    points: Floats,
+    ranges: Floats,
     starts: NDArray[np.int64],
     row: NDArray[np.int64],
     rows: int,
@@ -56,15 +57,15 @@ def project(
 
 @kernel
 def find_ground(
-    points: NDArray[np.float64],
+    points: Floats,
     nearest: NDArray[np.int64],
     columns: int,
-    up: NDArray[np.float64],
+    up: Floats,
     floor: float,
     slope: float,
     baseline: float,
     tolerance: float,
-) -> NDArray[np.bool_]:
+) -> Bools:
     """Whether the point of each pixel (rows * columns,) lies on the ground.
 
     Each column is followed from its lowest pixel. The first ground point of a column lies within `slope` and `tolerance`, m,
@@ -120,14 +121,14 @@ def _is_one_surface(a: float, b: float, sine: float, cosine: float, tangent: flo
 
 @kernel
 def cluster(
-    ranges: NDArray[np.float64],
+    ranges: Floats,
     nearest: NDArray[np.int64],
-    is_ground: NDArray[np.bool_],
+    is_ground: Bools,
     columns: int,
-    elevation: NDArray[np.float64],
+    elevation: Floats,
     angle: float,
     least: tuple[int, int, int],
-) -> NDArray[np.int32]:
+) -> Ints:
     """Label (rows * columns,) of the pixels off the ground: 1, 2, ... for clusters, 0 for pixels in none.
 
     Neighbours belong to one cluster when the line through them makes more than `angle`, rad, with the beam. Clusters are
@@ -202,15 +203,15 @@ def cluster(
 
 @kernel
 def give_back(
-    ranges: NDArray[np.float64],
+    ranges: Floats,
     order: NDArray[np.int64],
     pixel: NDArray[np.int64],
     nearest: NDArray[np.int64],
-    is_ground: NDArray[np.bool_],
-    labels: NDArray[np.int32],
+    is_ground: Bools,
+    labels: Ints,
     same: float,
     count: int,
-) -> tuple[NDArray[np.bool_], NDArray[np.int32]]:
+) -> tuple[Bools, Ints]:
     """Whether each point of a scan (count,) is ground, and its label (count,), from those of its pixel.
 
     A point takes those of its pixel when its range is within `same`, m, of the pixel's nearest point. Otherwise it is not

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats
 from lslam.core.kernels.jit import kernel
 
 _FULL = 2 * np.pi
@@ -13,7 +14,7 @@ _FULL = 2 * np.pi
 @kernel
 def follow(
     points: NDArray[np.float32], backward: float, tilt: float
-) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.int64], float]:
+) -> tuple[Floats, NDArray[np.float32], NDArray[np.int64], float]:
     """Follow the azimuth of points (N, 3) in the order in which they are stored.
 
     backward : largest step of the azimuth, rad, against the sense of rotation; a larger one is nearly a whole turn forward
@@ -74,8 +75,8 @@ def follow(
 
 @kernel
 def cut_rings(
-    angles: NDArray[np.float64], slope: NDArray[np.float32], seam: float
-) -> tuple[NDArray[np.uint16], NDArray[np.float64], NDArray[np.int64]]:
+    angles: Floats, slope: NDArray[np.float32], seam: float
+) -> tuple[NDArray[np.uint16], Floats, NDArray[np.int64]]:
     """Ring (N,) of each point, counted from 0: a new ring begins whenever the angle `turned` (N,), rad, passes the `seam`, rad.
 
     Returns also the mean slope (rings,) of each ring, and the number of its points with a slope (rings,).

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats
 from lslam.core.geometry import se3
 from lslam.core.geometry.se3 import poses_at
 from lslam.core.kernels import transform
-from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Span
 from lslam.registration.preprocessing.prepare import PreparedPoints

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Bools, Floats, Longs
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.config.odometry import LoamConfig
 from lslam.core.errors import InputError
 from lslam.core.geometry import so3
 from lslam.core.kernels.linearisation import SIGNIFICANT_SIGMAS
-from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.core.types.scan import Scan
 from lslam.registration.kernels import curvature
 from lslam.registration.kernels.curvature import WIDEST_STEP

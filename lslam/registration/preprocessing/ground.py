@@ -21,10 +21,10 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats, Longs
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.geometry import so3
 from lslam.core.kernels import ground
-from lslam.core.types.arrays import Floats, Longs
 
 # m; cells of the grid, and the farthest that ground is looked for.
 GROUND_CELL_M = 0.5

@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from lslam.core.arrays import Bools, Floats
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.config.odometry import LoamConfig
 from lslam.core.errors import InputError
 from lslam.core.kernels.linearisation import SIGNIFICANT_SIGMAS
-from lslam.core.types.arrays import Bools, Floats
 from lslam.core.types.scan import NO_RING, Scan
 from lslam.registration.kernels import curvature, petals
 from lslam.registration.kernels.curvature import WIDEST_STEP

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Bools, Floats, Ints, Longs
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.errors import InputError
 from lslam.core.kernels import voxel
-from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.registration.preprocessing.ground import above_ground, up_of
 
 # The field of view of a spinning scanner, 360 x 45 deg. With a smaller one the test is more lenient.
@@ -29,7 +29,7 @@ MOST_REMOVED_SHARE = 0.5
 DENOISE_NEIGHBOURS, DENOISE_DEVIATIONS = 10, 2.0
 
 
-def on_surfaces(centroids: NDArray[np.float32], counts: NDArray[np.int32], leaf: float, least_line: float) -> Longs:
+def on_surfaces(centroids: NDArray[np.float32], counts: Ints, leaf: float, least_line: float) -> Longs:
     """Indices of the centroids (M, 3), m, LiDAR frame, of cells of edge `leaf`, m, that a surface may lie in.
 
     A drop occupies a cell of its own where a surface has many returns per cell: a tenth of the returns can be two thirds of

@@ -12,9 +12,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Floats
 from lslam.core.config.input import RINGS
 from lslam.core.errors import InputError, UsageError
-from lslam.core.types.arrays import Floats
 from lslam.core.types.scan import NO_RING, Scan
 from lslam.registration.kernels import ring_order
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lslam.core.arrays import Bools, Floats, Ints, Longs
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.config.odometry import LoamConfig
-from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.core.types.scan import Scan
 from lslam.registration.kernels import range_image
 from lslam.registration.preprocessing.features import (
@@ -51,7 +50,7 @@ class Segments:
     """
 
     ground: Bools
-    labels: NDArray[np.int32]
+    labels: Ints
 
     @property
     def count(self) -> int:

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.core.types.arrays import Floats
+from lslam.core.arrays import Floats
 from lslam.core.types.scan import Scan
 from lslam.registration.preprocessing.rings import organised_rows, ring_seam
 

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.arrays import Bools, Floats, Longs
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.errors import InputError
 from lslam.core.labels import table_of
-from lslam.core.types.arrays import Bools, Longs
 from lslam.core.types.scan import NO_RING, Scan, Span
 from lslam.core.types.sequence import Sequence, SequenceView, readable
 from lslam.registration.preprocessing.rings import RingRule, decide_rings
@@ -33,8 +33,6 @@ _LONGEST_SWEEP = 1.5
 _SYNCHRONOUS_NS = 1_000_000  # clouds without times that are no further apart belong to one instant
 # Points nearer to their own sensor hit what carries it; the run's gate measures from the leading one.
 _NEAREST_M = float(PreprocessConfig.model_fields["range_min"].default)
-
-Matrix = NDArray[np.float64]
 
 
 class ClockView(SequenceView):
@@ -148,7 +146,7 @@ class FurtherLidar:
 
     name: str
     scans: Sequence
-    T_lidar_other: Matrix
+    T_lidar_other: Floats
     source: str = "as stated"
 
 
@@ -294,7 +292,7 @@ def _is_far(points: NDArray[np.float32]) -> Bools:
         return np.asarray((squared >= np.float32(_NEAREST_M**2)) & np.isfinite(squared))
 
 
-def _transform(scan: Scan, which: Bools, at_ns: Longs, stamp_ns: int, T: Matrix, number: int) -> Scan:
+def _transform(scan: Scan, which: Bools, at_ns: Longs, stamp_ns: int, T: Floats, number: int) -> Scan:
     """The points `is_used`, of the `number`-th further LiDAR, in the frame of the leading one, with times from `stamp_ns`."""
     from lslam.core.kernels.transform import transform
 

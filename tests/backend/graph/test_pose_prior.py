@@ -10,9 +10,9 @@ from lslam.backend.graph.fix_noise import GaussMarkovNoise
 from lslam.backend.graph.marginals import pose_prior
 from lslam.backend.graph.pose_graph import optimise
 from lslam.backend.graph.problem import PoseGraph, PositionFix
+from lslam.core.arrays import Floats
 from lslam.core.config.backend import GraphConfig
 from lslam.core.geometry import noise, se3, so3
-from lslam.core.types.arrays import Floats
 from lslam.core.types.constraint import Constraint
 
 COUNT = 5

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lslam.core.arrays import Floats, Longs
 from lslam.core.geometry import se3, so3
-from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.imu import WheelStream
 from lslam.core.types.scan import Span
 from lslam.odometry.inertial.constant_velocity import ConstantVelocity
