@@ -93,7 +93,7 @@ def test_a_manifest_with_another_clock_is_refused(folder: Path, tmp_path: Path) 
 
 def test_info_says_the_clock_and_how_clear_it_was(folder: Path) -> None:
     shown = CliRunner().invoke(cli, ["info", str(folder), "--json"])
-    facts = json.loads(shown.output)
+    facts = json.loads(shown.stdout)
     assert facts["point_times"]["verdict"] == "clear"
     assert facts["points"]["per_point_times"][1] == pytest.approx(0.1, abs=0.005)
     assert any("clear by the agreement of scans (t = " in note for note in facts["notes"])
