@@ -37,7 +37,7 @@ ALL_ALIKE = RegistrationConfig(sigma=NEAR_M, weak_share=0.0)
 # m above the ground: crash barriers are lower, along which a sensor's rings match best where nothing moved.
 HIGH_M = 1.2
 # m; from so far away they find each other: starts that far apart leave no gap, not even between piers of a facade.
-START_STEP_M = RegistrationConfig().kernel_max
+START_STEP_M = 1.0
 # A hand-held sensor turns at 100 deg/s, by 30 deg at every third scan; so far apart that 20 m away a step is left.
 START_TURNS_DEG = np.delete(np.arange(-30.0, 31.0, RECOVER_DEG), 10)
 # Along a bare wall the rings repeat best where nothing moved, by five percent: a start elsewhere must have more, and twice

@@ -214,9 +214,9 @@ def _first_guess(
 
 
 def _is_static(part: FirstPoses) -> bool:
-    """Whether no point at `LEVER_M` moves in the first second, by the poses of its scans."""
+    """Whether no point at `LEVER_M` moves in the first second, by the poses of its scans; False of fewer than three."""
     early = part.poses[part.stamps_ns < part.stamps_ns[0] + 1_000_000_000]
-    return max(apart(part.poses[0], pose, LEVER_M) for pose in early) < STILL_M
+    return len(early) > 2 and max(apart(part.poses[0], pose, LEVER_M) for pose in early) < STILL_M
 
 
 def _farthest(poses: Floats) -> float:

@@ -39,8 +39,8 @@ from lslam.registration.result import RegistrationResult
 
 # Edge of a cell of directions, rad: two rings of sixteen beams, a hundred shots.
 CELL_RAD = float(np.deg2rad(5.0))
-# Points that fill a cell of directions.
-FILLING = 3
+# Points that tell the directions of a scan, and that fill a cell of them.
+DIRECTION_POINTS, FILLING = 20_000, 3
 # Share of the directions that empty: far from the few per cent of dropouts, and from the half and more of a cloud that leaves.
 EMPTIED_SHARE = 0.25
 # Cells are numbered by row, from the pole below upwards.
@@ -61,7 +61,7 @@ def directions(points: Floats) -> Longs:
 
 def filled_directions(points: NDArray[np.floating]) -> Longs:
     """Numbers of the cells of `directions` that hold some of the points (N, 3), m."""
-    cloud = points[:, :3].astype(np.float64)
+    cloud = points[:: 1 + len(points) // DIRECTION_POINTS, :3].astype(np.float64)
     ranges = np.linalg.norm(cloud, axis=1)
     cells, filling = np.unique(directions(cloud[np.isfinite(ranges) & (ranges > 0)]), return_counts=True)
     return np.asarray(cells[filling >= FILLING])

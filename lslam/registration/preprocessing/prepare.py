@@ -19,8 +19,8 @@ from lslam.registration.preprocessing.ground import above_ground, up_of
 
 # The field of view of a spinning scanner, 360 x 45 deg. With a smaller one the test is more lenient.
 FIELD_OF_VIEW_SR = 4.8
-# m; wide enough for several pulses of one ring at fifty metres.
-WIDE_CELL_M = PreprocessConfig().source_voxel
+# m; wide enough for several pulses of one ring at fifty metres, and as the source points' grid begins.
+WIDE_CELL_M = 1.0
 # Least share of sparse cells: edges make up to a fifth of a clear scan's cells sparse.
 SPARSE_CELLS_SHARE = 0.25
 # Largest share of returns to remove: beyond, the scan was downsampled before.

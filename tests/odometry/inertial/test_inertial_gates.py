@@ -125,6 +125,14 @@ def test_a_static_start_neither_moves_nor_turns_for_a_second(
     assert _is_static(FirstPoses(stamps, poses, stamps, poses)) == stands
 
 
+@pytest.mark.parametrize(("first_scan", "stands"), [(0, True), (1, False), (2, False)])
+def test_a_static_start_needs_three_scans(first_scan: int, stands: bool) -> None:
+    """Within a second of the first one: a scan by itself has not moved."""
+    stamps = np.array([0, 600_000_000, 900_000_000, 1_650_000_000])[first_scan:]
+    poses = np.tile(np.eye(4), (len(stamps), 1, 1))
+    assert _is_static(FirstPoses(stamps, poses, stamps, poses)) == stands
+
+
 def test_the_sigma_of_the_first_velocity_follows_the_noise_of_the_scans() -> None:
     """A sensor at rest whose places are seen with white noise of 0.2 m: the speed that they fit errs by as much as is said."""
     stamps = np.arange(0, 3_100_000_000, IMU_NS)
