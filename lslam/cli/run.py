@@ -14,7 +14,7 @@ from lslam.cli import options
 from lslam.cli.console import log, progress, setup_logging, show
 from lslam.cli.one_run import arguments_of, print_result, read_truth
 from lslam.core.errors import GateError, UsageError
-from lslam.core.machine import rarely_collecting
+from lslam.core.machine import keeping_objects
 from lslam.io.remote import as_path
 from lslam.registration.residuals import RESIDUALS, find_residual
 
@@ -106,7 +106,7 @@ def command(sequence: str | None, **given: Any) -> None:
     with collect_warnings(), helper_process():
         _check_folder(given)
         ahead = None if given["dry_run"] else partial(start_helper, if_cold=True)
-        with progress("opening"), rarely_collecting():
+        with progress("opening"), keeping_objects():
             recording, config = open_with({**given, "sequence": sequence}, ahead)
             from lslam.pipeline.run import plan, run
             from lslam.pipeline.run_folder import default_folder

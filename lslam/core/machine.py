@@ -80,3 +80,14 @@ def rarely_collecting() -> Iterator[None]:
         yield
     finally:
         gc.set_threshold(*before)
+
+
+@contextlib.contextmanager
+def keeping_objects() -> Iterator[None]:
+    """Collect no garbage inside the block, and never look at its objects again: modules are permanent."""
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.freeze()
+        gc.enable()

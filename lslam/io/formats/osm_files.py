@@ -11,7 +11,6 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import IO, Any
 from xml.etree.ElementTree import Element, ParseError
-from xml.sax.saxutils import quoteattr
 
 from lslam.core.errors import InputError, input_errors
 from lslam.core.untrusted import JsonItems
@@ -170,7 +169,7 @@ def _add_xml(data: OsmData, element: Element) -> None:
 def _xml_lines(data: OsmData) -> Iterator[str]:
     """Lines of an OSM XML file with all elements of `data`."""
     yield "<?xml version='1.0' encoding='UTF-8'?>\n"
-    credit = f" attribution={quoteattr(data.attribution)}" if data.attribution else ""
+    credit = f" attribution={_quote(data.attribution)}" if data.attribution else ""
     yield f'<osm version="0.6" generator="{GENERATOR}"{credit}>\n'
     if data.nodes:
         lats, lons = zip(*data.nodes.values(), strict=True)
@@ -202,6 +201,8 @@ def _tag_lines(tags: Iterable[tuple[str, str]]) -> Iterator[str]:
 
 
 def _quote(text: str) -> str:
+    from xml.sax.saxutils import quoteattr  # with what speaks to servers
+
     # XML has no way to write most control characters.
     return quoteattr("".join(c for c in text if c.isprintable() or c in "\t\n\u00a0"))
 
