@@ -18,6 +18,7 @@ from lslam.maps.sorted_runs import KeyedRows, StoredRows
 MODEL = np.array([85, -41, -200, 350], np.int64)
 _START_ROWS = 1 << 17
 _MOST_ROWS = 4_000_000
+_MOST_BOX_CELLS = 1 << 26  # cells that a scan's beams are followed through at a time, a byte each
 
 
 @dataclass(frozen=True)
@@ -105,14 +106,13 @@ class OccupancyMapper:
                 "range_min"
             )
         self._voxel, self._range = float(voxel), (float(range_min), float(range_max))
-        self._longest = int(3 * range_max / voxel) + 4
         self._most, self._table = most, KeyedRows(5, _START_ROWS, spool, keep)
         self._origin = origin
         self.scans = 0
 
     def add(self, points: NDArray[Any], T_world_lidar: Floats) -> None:
         """Add a deskewed scan: points (N, 3), m, in the LiDAR frame, and its pose (4, 4), which is skipped if not finite."""
-        from lslam.maps.kernels.cells import carve, mark_ends
+        from lslam.maps.kernels.cells import cells_on_beams, mark_ends, mark_misses
 
         T = np.ascontiguousarray(T_world_lidar, np.float64)
         if not np.isfinite(T).all() or np.abs(T[:3, 3]).max() / self._voxel > 2.0**52:
@@ -124,18 +124,22 @@ class OccupancyMapper:
         table = self._table
         if table.used > self._most:
             table.spill()
-        table.reserve(table.used + len(cloud) + self._longest)
+        table.reserve(table.used + len(cloud))
         stamp = self.scans
         self.scans += 1
         table.used, ends = mark_ends(
             cloud, T, *self._range, self._voxel, self._origin, table.slots, table.rows, table.used, stamp, MODEL
         )
-        done = 0
-        while done < len(ends):
-            table.reserve(table.used + self._longest)
-            table.used, done = carve(
-                ends, done, start, self._longest, self._origin, table.slots, table.rows, table.used, stamp, MODEL
-            )
+        corners = np.concatenate([ends, start[None]])
+        # A cell around: rounding leads a beam past its end.
+        low, high = np.floor(corners.min(0)).astype(np.int64) - 1, np.floor(corners.max(0)).astype(np.int64) + 2
+        thickness = max(_MOST_BOX_CELLS // int(np.prod(high[1:] - low[1:])), 1)
+        for x in range(low[0], high[0], thickness):
+            size = high - low
+            first, size[0] = np.array([x, *low[1:]]), min(thickness, high[0] - x)
+            keys = cells_on_beams(ends, start, first, size, self._origin)
+            table.reserve(table.used + len(keys))
+            table.used = mark_misses(keys, table.slots, table.rows, table.used, stamp, MODEL)
 
     def result(self) -> OccupancyGrid:
         """Grid of the observed cells; empties the mapper."""

@@ -25,6 +25,8 @@ from lslam.core.kernels.voxel import BLOCK
 AXIS_BITS = 21
 HALF = 1 << (AXIS_BITS - 1)
 _MIX = -7046029254386353131  # 0x9E3779B97F4A7C15 as int64: Fibonacci hashing
+_IN_BLOCK = (1 << 2 * AXIS_BITS) | (1 << AXIS_BITS) | 3  # bits of a key that tell the 2 x 2 x 4 cells of a block apart
+_STEP = 17  # slots from one that is taken to the next to try: odd, and past those of the block
 UNITS = float(2**24)  # 2**39 points fit into one voxel's sum
 INTENSITY_UNITS = float(2**20)
 _BRIGHTEST = float(2**24)  # of such points a voxel's sum holds 2**19
@@ -44,9 +46,10 @@ def pack(ix: int, iy: int, iz: int) -> int:
 
 @inline
 def slot_of(key: int, mask: int) -> int:
-    """First slot to try for a key in a table of mask + 1 slots."""
-    mixed = key * _MIX
-    return (mixed ^ (mixed >> 29) ^ (mixed >> 43)) & mask
+    """First slot to try for a key in a table of mask + 1 slots; 2 x 2 x 4 cells share a line of the cache."""
+    mixed = (key & ~_IN_BLOCK) * _MIX
+    within = ((key >> 39) & 8) | ((key >> 19) & 4) | (key & 3)
+    return (mixed ^ (mixed >> 29) ^ (mixed >> 43) ^ within) & mask
 
 
 @inline
@@ -61,7 +64,7 @@ def row_of(key: int, slots: Ints, rows: NDArray[np.int64], row_count: int) -> in
     slot = slot_of(key, mask)
     row = slots[slot]
     while row >= 0 and rows[row, 0] != key:
-        slot = (slot + 1) & mask
+        slot = (slot + _STEP) & mask
         row = slots[slot]
     if row < 0:
         row = row_count
@@ -77,7 +80,7 @@ def enter(slots: Ints, rows: NDArray[np.int64], row_count: int) -> None:
     for row in range(row_count):
         slot = slot_of(rows[row, 0], mask)
         while slots[slot] >= 0:
-            slot = (slot + 1) & mask
+            slot = (slot + _STEP) & mask
         slots[slot] = row
 
 
@@ -305,56 +308,73 @@ def mark_ends(
 
 
 @kernel
-def carve(
-    ends: Floats,
-    begin: int,
-    start: Floats,
-    longest: int,
-    origin: NDArray[np.int64],
-    slots: Ints,
-    rows: NDArray[np.int64],
-    row_count: int,
-    stamp: int,
-    model: NDArray[np.int64],
-) -> tuple[int, int]:
-    """Update the cells that the beams cross before their ends with a miss, once each (Amanatides and Woo 1987).
+def cells_on_beams(
+    ends: Floats, start: Floats, low: NDArray[np.int64], size: NDArray[np.int64], origin: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Keys of the cells of a box that beams cross before their ends, rising (Amanatides and Woo 1987).
 
-    start : (3,) common start of the beams, in cells; ends : (E, 3), in cells; longest : most cells that a beam crosses
-    begin : first beam to cast; row_count : rows used before; the rest as in `mark_ends`
-    Returns the rows used now, and the index of the first beam that was not cast because `rows` was full, else len(ends).
+    start : (3,) common start of the beams; ends : (E, 3); both in cells; origin : as in `mark_ends`
+    low : (3,) first cell of the box; size : (3,) cells along its edges; beams leave it along x only
     """
-    cell = np.empty(3, np.int64)
-    last = np.empty(3, np.int64)
+    # Near the sensor many beams cross a cell: it is looked up once, and neighbours one after the other.
+    is_on_beam = np.zeros(size[0] * size[1] * size[2], np.bool_)
+    strides = np.array([size[1] * size[2], size[2], 1])
     step = np.empty(3, np.int64)
     due = np.empty(3)
     each = np.empty(3)
-    for i in range(begin, len(ends)):
-        if row_count + longest > rows.shape[0]:
-            return row_count, i
+    for i in range(len(ends)):
+        at, last = np.int64(0), np.int64(0)
         for k in range(3):
             d = ends[i, k] - start[k]
-            cell[k] = np.int64(np.floor(start[k]))
-            last[k] = np.int64(np.floor(ends[i, k]))
-            step[k] = 1 if d > 0 else -1
+            cell = np.floor(start[k])
+            at += (np.int64(cell) - low[k]) * strides[k]
+            last += (np.int64(np.floor(ends[i, k])) - low[k]) * strides[k]
+            step[k] = strides[k] if d > 0 else -strides[k]
             each[k] = abs(1.0 / d) if d != 0.0 else np.inf
-            edge = cell[k] + 1.0 - start[k] if d > 0 else start[k] - cell[k]
+            edge = cell + 1.0 - start[k] if d > 0 else start[k] - cell
             due[k] = edge * each[k] if d != 0.0 else np.inf
-        for _ in range(longest):
-            if cell[0] == last[0] and cell[1] == last[1] and cell[2] == last[2]:
+        due_x, due_y, due_z = due
+        while at != last:
+            if 0 <= at < len(is_on_beam):
+                is_on_beam[at] = True
+            first = min(due_x, due_y, due_z)
+            if first > 1.0:
                 break
-            key = pack(cell[0] - origin[0], cell[1] - origin[1], cell[2] - origin[2])
-            if key >= 0:
-                row = _seen_row(key, slots, rows, row_count)
-                row_count += row == row_count
-                if rows[row, 4] != stamp:
-                    rows[row, 4] = stamp
-                    _update(rows, row, model[1], model[2], model[3])
-            k = 0 if due[0] <= due[1] and due[0] <= due[2] else 1 if due[1] <= due[2] else 2
-            if due[k] > 1.0:
-                break
-            cell[k] += step[k]
-            due[k] += each[k]
-    return row_count, len(ends)
+            if due_x == first:
+                at, due_x = at + step[0], due_x + each[0]
+            elif due_y == first:
+                at, due_y = at + step[1], due_y + each[1]
+            else:
+                at, due_z = at + step[2], due_z + each[2]
+    keys = np.empty(np.count_nonzero(is_on_beam), np.int64)
+    count, at = 0, np.int64(0)
+    for x in range(size[0]):
+        for y in range(size[1]):
+            for z in range(size[2]):
+                if is_on_beam[at]:
+                    keys[count] = pack(x + low[0] - origin[0], y + low[1] - origin[1], z + low[2] - origin[2])
+                    count += 1
+                at += 1
+    return keys
+
+
+@kernel
+def mark_misses(
+    keys: NDArray[np.int64], slots: Ints, rows: NDArray[np.int64], row_count: int, stamp: int, model: NDArray[np.int64]
+) -> int:
+    """Update cells with a miss, unless the scan has updated them before; returns the rows used now.
+
+    keys : of the cells, -1 for none; the rest as in `mark_ends`
+    """
+    for key in keys:
+        if key < 0:
+            continue
+        row = _seen_row(key, slots, rows, row_count)
+        row_count += row == row_count
+        if rows[row, 4] != stamp:
+            rows[row, 4] = stamp
+            _update(rows, row, model[1], model[2], model[3])
+    return row_count
 
 
 @kernel
