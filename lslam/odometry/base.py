@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
 from lslam.core.arrays import Floats
+from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
-from lslam.core.types.scan_result import ScanEquations, ScanResult
+from lslam.core.types.scan_result import ScanEquations, ScanResult, StageClock
 from lslam.core.types.state import State, Stateful
-from lslam.odometry.scan_outcome import to_scan_result
+from lslam.odometry.scan_outcome import judge, to_scan_result
 from lslam.odometry.uncertainty import PoseUncertainty
 from lslam.registration.preprocessing.features import Features
 from lslam.registration.registration import Registration
@@ -132,6 +134,35 @@ class Resumable(Method, Protocol):
     def restore(self, state: State) -> None:
         """Go on where `state` was taken, in an object made by the same configuration."""
         ...
+
+
+class AligningMethod(Traits, ABC):
+    """A method that aligns a scan by itself, or by a package, and is judged by limits of the section `registration`."""
+
+    limits: RegistrationConfig
+
+    @abstractmethod
+    def align(self, prepared: Any, T_prior: Floats) -> RegistrationResult:
+        """Align what `prepare` made of a scan, from the prior (4, 4); the prior itself where there is nothing to align with."""
+
+    @abstractmethod
+    def enter(self, prepared: Any, result: ScanResult) -> None:
+        """Learn from a scan, whether its alignment was accepted or not."""
+
+    def register(self, scan: Scan, prepared: Any, prior: MotionPrior) -> ScanResult:
+        """Align the scan, judge and enter it; `bridged` by the prior where it is rejected."""
+        clock = StageClock()
+        with clock.stage("register"):
+            alignment = self.align(prepared, prior.pose)
+        with clock.stage("update"):
+            result = replace(judge(scan, alignment, prior.pose, self.limits), stages=clock.seconds)
+            self.enter(prepared, result)
+        return result
+
+
+def keep_prior(T_prior: Floats, count: int) -> RegistrationResult:
+    """The prior (4, 4), for `count` points that nothing is there to align with."""
+    return RegistrationResult(T_prior, source_points=count, inliers=count)
 
 
 class MapMethod(Traits, Stateful):

@@ -16,12 +16,13 @@ import numpy as np
 
 from lslam.core.arrays import Floats
 from lslam.core.geometry import se3, so3
+from lslam.core.geometry.noise import changes
 from lslam.core.kernels import linearisation as at
 from lslam.core.kernels.gauss_newton import UNSEEN_SHARE
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.registration.alignment import voxel_terms
 from lslam.registration.gaussian_map import GaussianMap
-from lslam.registration.optimiser import STEP_M, STEP_RAD, Annealing, Correspondences, Term, pose_change
+from lslam.registration.optimiser import STEP_M, STEP_RAD, Annealing, Correspondences, Term
 from lslam.registration.preprocessing.deskew import deskew_points
 from lslam.registration.preprocessing.prepare import PreparedPoints, subset
 from lslam.registration.residuals import find_residual
@@ -110,7 +111,7 @@ class ElasticConstraints:
 
         Location consistency and constant velocity: Dellenbach et al. 2022, section III-B.
         """
-        begin, end = pose_change(sweep.begin, self.expected.begin), pose_change(sweep.end, self.expected.end)
+        begin, end = changes(self.expected.begin, sweep.begin), changes(self.expected.end, sweep.end)
         # The middle is half of both ends.
         steady = (-1.0 - self.since / 2, 1.0 - self.since / 2, 0.0)
         for W, signs in (

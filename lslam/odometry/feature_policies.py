@@ -13,7 +13,7 @@ from lslam.odometry.feature_map import MIN_LINE_POINTS
 from lslam.odometry.feature_solver import remap_solution
 from lslam.registration.attempt import RECOVER_M, Attempt, Policy
 from lslam.registration.history import History
-from lslam.registration.policies import best_by_non_ground, policies_of
+from lslam.registration.policies import AtRest, CoarseToFine, best_by_non_ground
 from lslam.registration.preprocessing.prepare import prepare_points
 from lslam.registration.registration import Registration
 from lslam.registration.result import RegistrationResult
@@ -164,7 +164,12 @@ def holds_position(result: RegistrationResult, sigma: float) -> bool:
 
 
 def feature_policies(config: RecoveryConfig) -> tuple[Policy, ...]:
-    """Those that a configuration switches on, in the order in which they are tried."""
-    own = [LessPlanar()] if config.less_planar else []
-    last = [AllPointsInstead()] if config.fallback == "all-points" else []
-    return policies_of(config, of_features=(*own, SolutionRemapping(), *last))
+    """Policies of features that are switched on, in the order in which they are tried."""
+    switches: tuple[tuple[bool, Policy], ...] = (
+        (config.coarse_to_fine, CoarseToFine(of_features=True)),
+        (config.less_planar, LessPlanar()),
+        (True, SolutionRemapping()),
+        (config.fallback == "all-points", AllPointsInstead()),
+        (config.at_rest, AtRest()),
+    )
+    return tuple(policy for is_on, policy in switches if is_on)

@@ -18,7 +18,16 @@ from lslam.odometry.kernels.feature_residuals import linearise_edges, linearise_
 from lslam.odometry.kernels.lines import linearise_lines
 from lslam.registration.alignment import prior_term, upright_directions, voxel_terms
 from lslam.registration.gaussian_map import FLOOR_M2, GaussianMap
-from lslam.registration.optimiser import EVERYWHERE, Annealing, Correspondences, Limits, Term, optimise, slots_of
+from lslam.registration.optimiser import (
+    EVERYWHERE,
+    Annealing,
+    Correspondences,
+    Limits,
+    Problem,
+    Term,
+    optimise,
+    slots_of,
+)
 from lslam.registration.preprocessing.features import Features
 from lslam.registration.residuals import PLANES_ALONE
 from lslam.registration.result import RegistrationResult
@@ -77,7 +86,8 @@ class ScanMatching:
             by_surfaces=True,
             directions=np.ascontiguousarray(directions),
         )
-        return optimise(terms, T_prior, self.annealing, limits, Correspondences(len(edges) + len(planes)))
+        matches = Correspondences(len(edges) + len(planes))
+        return optimise(Problem(terms, T_prior, self.annealing, limits, matches))
 
     def _settings(self, sigma: float) -> tuple[float, float, float, bool]:
         return float(self.target.size), float(self.target.reach), float(sigma) ** 2, bool(self.one_to_many)
@@ -116,7 +126,8 @@ def solve_on_map(
     on_planes = voxel_terms(PLANES_ALONE, (planes, scatter), levels or target.planes.levels, matches, noise.plane)
     limits = Limits(noise.weak_share, noise.least / noise.plane**2, unseen=1.0)
     prior = [] if information is None else [prior_term(T_prior, information)]
-    return optimise([on_lines, *on_planes, *prior], T_prior, annealing, limits, matches, inlier_ratio=inlier_ratio)
+    terms = [on_lines, *on_planes, *prior]
+    return optimise(Problem(terms, T_prior, annealing, limits, matches, inlier_ratio=inlier_ratio))
 
 
 def remap_solution(result: RegistrationResult, T_prior: Floats) -> RegistrationResult:

@@ -31,10 +31,7 @@ from lslam.odometry.feature_solver import (
 from lslam.registration.attempt import Attempt, Target
 from lslam.registration.history import History, is_more
 from lslam.registration.optimiser import (
-    COARSE_DECAY,
     COARSE_KERNEL_M,
-    KERNEL_DECAY,
-    KERNEL_MIN_M,
     START_ITERATIONS,
     Annealing,
 )
@@ -159,7 +156,7 @@ class FeatureTarget(Target):
         """Edges, and centroids of the less planar points, on fine and coarse planes, judged."""
         c, noise = self.config, self.noise(attempt.history)
         points, scatter = thin_planes(attempt.points)
-        annealing = Annealing(c.kernel_max, KERNEL_MIN_M, KERNEL_DECAY, START_ITERATIONS)
+        annealing = Annealing(c.kernel_max, START_ITERATIONS)
         edges = attempt.points.edges.points
         return attempt.judge(solve_on_map(self._planes(), edges, points, T_start, annealing, noise, scatter=scatter))
 
@@ -187,14 +184,12 @@ class FeatureTarget(Target):
         target, noise = self._planes(), self.noise(history)
 
         def on_coarse(start: Floats, width: float) -> RegistrationResult:
-            slow = Annealing(width, KERNEL_MIN_M, COARSE_DECAY, START_ITERATIONS)
-            levels = target.planes.coarser[:1]
+            slow, levels = Annealing.slow(width), target.planes.coarser[:1]
             return attempt.judge(solve_on_map(target, NONE, points, start, slow, noise, scatter=scatter, levels=levels))
 
         def edges_at(result: RegistrationResult) -> int:
             """How many of the less sharp edges lie on edges of the map; -1 where the registration failed."""
-            once = Annealing(c.kernel_max / 2, c.kernel_max / 2, 0.5, 1)
-            edges = attempt.points.less_edges.points
+            once, edges = Annealing.once(c.kernel_max / 2), attempt.points.less_edges.points
             return solve_on_map(target, edges, NONE, result.T_world_lidar, once, noise).inliers if result.ok else -1
 
         result = on_coarse(T_prior, COARSE_KERNEL_M)

@@ -12,9 +12,10 @@ from lslam.core.config.odometry import RecoveryConfig
 from lslam.core.errors import UsageError
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
+from lslam.core.types.scan_result import StageClock
 from lslam.odometry.base import MapMethod
 from lslam.odometry.elastic import ElasticConstraints, SweepPoints, register_elastic
-from lslam.registration.optimiser import KERNEL_DECAY, KERNEL_MIN_M, Annealing
+from lslam.registration.optimiser import KERNEL_MIN_M, Annealing
 from lslam.registration.preprocessing.deskew import deskew
 from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_points, small_room
 from lslam.registration.registration import Registration
@@ -72,15 +73,15 @@ class Icp(MapMethod):
         """Deskew by the prior and register on the local map; elastically where the motion comes from a window's course."""
         if prior.change is not None and self.is_elastic(prepared, prior):
             return self.register_sweep(prepared, ElasticConstraints.of_course(prior), prior, is_near)
-        began = time.perf_counter()
-        points = deskew(prepared, prior)
-        deskewed = time.perf_counter()
-        known = self.with_surfaces(points, prepared)
-        result = self.registration.locate(known, prior.pose, is_near, self.information_of(prior))
-        stages = {"register": time.perf_counter() - deskewed}
-        if points is not prepared:
-            stages = {"deskew": deskewed - began, **stages}
-        return replace(result, map_age=self.map_age, stages=stages)
+        clock = StageClock()
+        with clock.stage("deskew"):
+            points = deskew(prepared, prior)
+        if points is prepared:
+            del clock.seconds["deskew"]
+        with clock.stage("register"):
+            known = self.with_surfaces(points, prepared)
+            result = self.registration.locate(known, prior.pose, is_near, self.information_of(prior))
+        return replace(result, map_age=self.map_age, stages=clock.seconds)
 
     def with_surfaces(self, points: PreparedPoints, prepared: PreparedPoints) -> PreparedPoints:
         """The deskewed points with the covariances of their surfaces, if the residual needs them.
@@ -107,7 +108,7 @@ class Icp(MapMethod):
         attempt, c = registration.attempt(prepared, prior.pose, is_near), registration.config
         points = SweepPoints(prepared, registration.map.levels, c.sigma)
         width = max(attempt.annealing.start, KERNEL_MIN_M)
-        annealing = Annealing(width, KERNEL_MIN_M, KERNEL_DECAY, c.max_iterations)
+        annealing = Annealing(width, c.max_iterations)
         elastic = register_elastic(points, constraints.expected, constraints, annealing, c.weak_share)
         result = attempt.judge(elastic.result)
         sweep = replace(elastic.sweep.prior, change=prior.change) if result.ok else None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -14,12 +13,10 @@ from lslam.core.config.config import Config
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.geometry import se3, so3
-from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.state import Stateful
-from lslam.odometry.base import Traits
-from lslam.odometry.scan_outcome import judge
+from lslam.odometry.base import AligningMethod, keep_prior
 from lslam.registration.optimiser import STEP_M, STEP_RAD
 from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_points, small_room
 from lslam.registration.result import RegistrationResult
@@ -52,7 +49,7 @@ def create(config: Config) -> IcpSvd:
     return IcpSvd(config.preprocess, config.registration)
 
 
-class IcpSvd(Traits, Stateful):
+class IcpSvd(AligningMethod, Stateful):
     """Nearest neighbours, trimmed, then the best-fitting transform, iterated until it no longer changes.
 
     It uses `registration.inlier_ratio`, `inlier_distance`, `max_iterations` and the acceptance limits; it gives no covariance.
@@ -63,7 +60,7 @@ class IcpSvd(Traits, Stateful):
     STATE = ("_last", "_failed")
 
     def __init__(self, preprocess: PreprocessConfig, registration: RegistrationConfig) -> None:
-        self._preprocess, self._config = preprocess, registration
+        self._preprocess, self.limits = preprocess, registration
         self._last: Partners | None = None
         self._failed = 0
 
@@ -71,30 +68,27 @@ class IcpSvd(Traits, Stateful):
         """Range gate and down-sampling."""
         return prepare_points(scan.points, self._preprocess, scan.index)
 
-    def register(self, scan: Scan, prepared: PreparedPoints, prior: MotionPrior) -> ScanResult:
-        """Align with the last registered scan; after two failures in a row this scan replaces that."""
-        began = time.perf_counter()
-        c = self._config
+    def align(self, prepared: PreparedPoints, T_prior: Floats) -> RegistrationResult:
+        """Align with the last registered scan."""
+        c = self.limits
         if self._last is None or len(prepared.source) < MIN_SOURCE_POINTS:
-            alignment = RegistrationResult(prior.pose, source_points=len(prepared.source), inliers=len(prepared.source))
-        else:
-            alignment = align_closed_form(
-                prepared.source,
-                self._last,
-                prior.pose,
-                inlier_ratio=c.inlier_ratio,
-                inlier_distance=c.inlier_distance,
-                max_iterations=c.max_iterations,
-            )
-        aligned = time.perf_counter()
-        result = judge(scan, alignment, prior.pose, c, {})
+            return keep_prior(T_prior, len(prepared.source))
+        return align_closed_form(
+            prepared.source,
+            self._last,
+            T_prior,
+            inlier_ratio=c.inlier_ratio,
+            inlier_distance=c.inlier_distance,
+            max_iterations=c.max_iterations,
+        )
+
+    def enter(self, prepared: PreparedPoints, result: ScanResult) -> None:
+        """Make a registered scan the last one; after two failures in a row the scan that failed."""
         self._failed = 0 if result.status == "ok" else self._failed + 1
         if len(prepared.source) >= MIN_SOURCE_POINTS and self._failed in (0, 2):
-            is_sampled = c.target == "sample" and self._last is not None
+            is_sampled = self.limits.target == "sample" and self._last is not None
             points = prepared.source if is_sampled else prepared.map_points.astype(np.float64)
             self._last = Partners(points, result.T_world_lidar)
-        result.stages.update(register=aligned - began, update=time.perf_counter() - aligned)
-        return result
 
     def warm_up(self) -> None:
         """Compile or load the kernels of preprocessing."""

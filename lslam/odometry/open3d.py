@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,11 +13,9 @@ from lslam.core.config.input import PreprocessConfig
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.extras import importing_open3d
 from lslam.core.geometry import se3
-from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import ScanResult
-from lslam.odometry.base import Traits
-from lslam.odometry.scan_outcome import judge
+from lslam.odometry.base import AligningMethod, keep_prior
 from lslam.registration.preprocessing.prepare import clean_points
 from lslam.registration.result import RegistrationResult
 from lslam.registration.voxel_target import MIN_SOURCE_POINTS
@@ -42,14 +39,14 @@ def create(config: Config) -> Open3dGicp:
     return Open3dGicp(config.preprocess, config.registration)
 
 
-class Open3dGicp(Traits):
+class Open3dGicp(AligningMethod):
     """Open3D's generalised ICP (Segal 2009) with its own defaults. It has no map, so its drift adds up scan by scan."""
 
     def __init__(self, preprocess: PreprocessConfig, limits: RegistrationConfig) -> None:
         with importing_open3d():
             import open3d
         self._package: Any = open3d
-        self._preprocess, self._limits = preprocess, limits
+        self._preprocess, self.limits = preprocess, limits
         self._last: Reference | None = None
 
     def prepare(self, scan: Scan) -> Any:
@@ -61,24 +58,19 @@ class Open3dGicp(Traits):
             cloud.estimate_covariances(package.geometry.KDTreeSearchParamKNN(COVARIANCE_POINTS))
         return cloud
 
-    def register(self, scan: Scan, prepared: Any, prior: MotionPrior) -> ScanResult:
-        """Align with the last registered scan; `bridged` by the prior where that is rejected."""
-        began = time.perf_counter()
-        alignment = self._align(prepared, prior.pose)
-        result = judge(scan, alignment, prior.pose, self._limits, {})
+    def enter(self, prepared: Any, result: ScanResult) -> None:
+        """Make a registered scan the one that the next is aligned with."""
         if result.status == "ok":
             self._last = Reference(prepared, result.T_world_lidar)
-        result.stages["register"] = time.perf_counter() - began
-        return result
 
-    def _align(self, cloud: Any, T_prior: Floats) -> RegistrationResult:
+    def align(self, prepared: Any, T_prior: Floats) -> RegistrationResult:
         """Align the cloud with the last registered scan by Open3D; the prior itself without one."""
-        count = len(cloud.points)
+        count = len(prepared.points)
         if self._last is None or count < MIN_SOURCE_POINTS:
-            return RegistrationResult(T_prior, source_points=count, inliers=count)
+            return keep_prior(T_prior, count)
         registration = self._package.pipelines.registration
         alignment = registration.registration_generalized_icp(
-            cloud,
+            prepared,
             self._last.cloud,
             MATCH_REACH_M,
             se3.relative(self._last.T_world_lidar, T_prior),

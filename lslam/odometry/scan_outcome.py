@@ -45,9 +45,7 @@ def to_scan_result(scan: Scan, result: RegistrationResult, covariance: Floats | 
     )
 
 
-def judge(
-    scan: Scan, alignment: RegistrationResult, T_prior: Floats, c: RegistrationConfig, stages: dict[str, float]
-) -> ScanResult:
+def judge(scan: Scan, alignment: RegistrationResult, T_prior: Floats, c: RegistrationConfig) -> ScanResult:
     """The result of a scan that a package aligned: `ok`, or `bridged` by the motion prior when it is rejected.
 
     alignment : pose, points that were offered, and inliers, those with a partner within reach
@@ -61,7 +59,7 @@ def judge(
     else:
         pose = se3.normalise(alignment.T_world_lidar)
         result = limits.judge(replace(alignment, T_world_lidar=pose, matched=alignment.inliers), T_prior)
-    return to_scan_result(scan, replace(result, stages=stages), None, None)
+    return to_scan_result(scan, result, None, None)
 
 
 # s; over a shorter time a registration may err by as much as the fastest moves.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from typing import Any
 
 import numpy as np
@@ -13,11 +12,9 @@ from lslam.core.config.input import PreprocessConfig
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.extras import importing, install_hint
 from lslam.core.geometry import se3, so3
-from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import ScanResult
-from lslam.odometry.base import Traits
-from lslam.odometry.scan_outcome import judge
+from lslam.odometry.base import AligningMethod, keep_prior
 from lslam.registration.preprocessing.prepare import clean_points
 from lslam.registration.result import RegistrationResult
 from lslam.registration.voxel_target import MIN_SOURCE_POINTS
@@ -35,7 +32,7 @@ def create(config: Config) -> SmallGicp:
     return SmallGicp(config.preprocess, config.registration, config.input.workers)
 
 
-class SmallGicp(Traits):
+class SmallGicp(AligningMethod):
     """GICP, scan to keyframe map, by the package small_gicp; with several threads its sums may differ in the last digits."""
 
     def __init__(self, preprocess: PreprocessConfig, limits: RegistrationConfig, threads: int = 2) -> None:
@@ -43,7 +40,7 @@ class SmallGicp(Traits):
         with importing("small_gicp", install_hint("small-gicp")):
             import small_gicp
         self._package: Any = small_gicp
-        self._preprocess, self._limits, self._threads = preprocess, limits, threads
+        self._preprocess, self.limits, self._threads = preprocess, limits, threads
         self._clouds: list[Floats] = []
         self._target: tuple[Any, Any] | None = None
         self._T_world_keyframe = np.eye(4)
@@ -53,25 +50,19 @@ class SmallGicp(Traits):
         points = clean_points(scan.points, self._preprocess)
         return self._with_covariances(points.astype(np.float64))[0] if len(points) >= MIN_SOURCE_POINTS else None
 
-    def register(self, scan: Scan, prepared: Any, prior: MotionPrior) -> ScanResult:
-        """Align with the local map; the scan becomes a keyframe of it when the sensor has moved far enough."""
-        began = time.perf_counter()
-        alignment = self._align(prepared, prior.pose)
-        aligned = time.perf_counter()
-        result = judge(scan, alignment, prior.pose, self._limits, {})
+    def enter(self, prepared: Any, result: ScanResult) -> None:
+        """Make the scan a keyframe of the local map when the sensor has moved far enough."""
         if result.status == "ok" and self._has_moved_on(result.T_world_lidar):
             self._insert(np.asarray(prepared.points())[:, :3], result.T_world_lidar)
-        result.stages.update(register=aligned - began, update=time.perf_counter() - aligned)
-        return result
 
-    def _align(self, source: Any, T_prior: Floats) -> RegistrationResult:
+    def align(self, prepared: Any, T_prior: Floats) -> RegistrationResult:
         """Align prepared points with the map by small_gicp; the prior itself without a map or with too few points."""
-        count = 0 if source is None else source.size()
+        count = 0 if prepared is None else prepared.size()
         if self._target is None or count < MIN_SOURCE_POINTS:
-            return RegistrationResult(T_prior, source_points=count, inliers=count)
+            return keep_prior(T_prior, count)
         target, tree = self._target
         alignment = self._package.align(
-            target, source, tree, T_prior, max_correspondence_distance=MATCH_REACH_M, num_threads=self._threads
+            target, prepared, tree, T_prior, max_correspondence_distance=MATCH_REACH_M, num_threads=self._threads
         )
         pose = np.asarray(alignment.T_target_source, np.float64)
         return RegistrationResult(

@@ -15,7 +15,7 @@ from lslam.registration.acceptance import Acceptance
 from lslam.registration.alignment import solve
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.local_map import COARSE_FACTOR
-from lslam.registration.optimiser import KERNEL_DECAY, Annealing
+from lslam.registration.optimiser import Annealing
 from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_points, small_room
 from lslam.registration.residuals import PLANES_ALONE
 from lslam.registration.result import RegistrationResult
@@ -94,7 +94,7 @@ class StationaryDetector(Stateful):
 
     def _step(self, points: PreparedPoints) -> RegistrationResult:
         c = self._config
-        once = Annealing(c.kernel_max, c.kernel_max, KERNEL_DECAY, 1)
+        once = Annealing.once(c.kernel_max)
         return solve((self._planes,), points, np.eye(4), once, c, residual=PLANES_ALONE)
 
     def _is_stationary(self, scan: Scan) -> bool:

@@ -178,7 +178,7 @@ def _align(
     ground.insert(_upright(target, HEIGHTS).astype(np.float32), np.eye(4))
     upright = _upright(source, HEIGHTS)
     points = PreparedPoints(upright.astype(np.float32), upright, np.zeros((len(upright), 6)), len(upright))
-    annealing, c = Annealing(WIDTH, 0.5, 0.8, STEPS), RegistrationConfig(sigma=NOISE, weak_share=0.0)
+    annealing, c = Annealing(WIDTH, STEPS, 0.5, 0.8), RegistrationConfig(sigma=NOISE, weak_share=0.0)
     found = solve(
         (ground,), points, se2.to_se3(prior), annealing, c, residual=replace(find_residual(residual), blob_weight=1.0)
     )

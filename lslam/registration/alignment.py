@@ -17,10 +17,8 @@ from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.kernels import prior_residual
 from lslam.registration.local_map import LocalMap
 from lslam.registration.optimiser import (
-    COARSE_DECAY,
     COARSE_KERNEL_M,
     EVERYWHERE,
-    KERNEL_DECAY,
     KERNEL_MIN_M,
     START_ITERATIONS,
     Annealing,
@@ -48,12 +46,12 @@ def solve(
 ) -> RegistrationResult:
     """Align the source points with maps by annealed Gauss-Newton, starting at `T_prior` (4, 4), as `c` weighs them.
 
-    Points without a plane or a blob in one of the maps, the finest first, are matched in the next. `directions` as in `Limits`.
+    Points without a match in one of the maps, the finest first, are matched in the next. `directions` as in `Limits`.
     """
     matches = Correspondences(len(points.source))
     terms = voxel_terms(residual, residual.points(points, c.sigma), levels, matches, c.sigma)
     limits = Limits(c.weak_share, by_surfaces=residual.by_surfaces, directions=directions)
-    return optimise(terms, T_prior, annealing, limits, matches)
+    return optimise(Problem(terms, T_prior, annealing, limits, matches))
 
 
 def prior_term(T_prior: Floats, information: Floats) -> Term:
@@ -136,8 +134,7 @@ class MapAlignment:
             terms.append(prior_term(start, information))
         limits = Limits(c.weak_share, by_surfaces=self.kind.by_surfaces, directions=directions)
         farthest = np.inf if c.inlier_distance is None else c.inlier_distance
-        annealing = Annealing(width, end, KERNEL_DECAY, steps)
-        return Problem(terms, start, annealing, limits, matches, farthest, c.inlier_ratio)
+        return Problem(terms, start, Annealing(width, steps, end), limits, matches, farthest, c.inlier_ratio)
 
     def _recall(self, count: int) -> Correspondences:
         """What was looked up for as many points in the map as it is: a scan is deskewed twice, and moves little between."""
@@ -156,9 +153,9 @@ class MapAlignment:
         """
         c = self.config
         coarser = self.coarse_maps(points, T_prior)
-        coarse = solve(coarser[:1], points, T_prior, self.slowly(min(width, COARSE_KERNEL_M)), c)
+        coarse = solve(coarser[:1], points, T_prior, Annealing.slow(min(width, COARSE_KERNEL_M)), c)
         start = coarse.T_world_lidar if coarse.ok else T_prior
-        fine = optimise(*self.problem(points, start, c.kernel_max, START_ITERATIONS, coarser))
+        fine = optimise(self.problem(points, start, c.kernel_max, START_ITERATIONS, coarser))
         return replace(fine, iterations=coarse.iterations + fine.iterations)
 
     def coarse_maps(self, points: PreparedPoints, T_prior: Floats) -> tuple[GaussianMap, ...]:
@@ -167,15 +164,10 @@ class MapAlignment:
         From thirty metres above the ground the rings of one scan lie metres apart.
         """
         c, coarser = self.config, self.map.coarser
-        once = Annealing(COARSE_KERNEL_M, COARSE_KERNEL_M, COARSE_DECAY, 1)
         for k, level in enumerate(coarser):
-            if solve((level,), points, T_prior, once, c).overlap >= c.min_overlap:
+            if solve((level,), points, T_prior, Annealing.once(COARSE_KERNEL_M), c).overlap >= c.min_overlap:
                 return coarser[k:]
         return coarser[-1:]
-
-    def slowly(self, width: float) -> Annealing:
-        """A kernel that closes from `width`, m, so slowly that coarse planes are followed."""
-        return Annealing(width, KERNEL_MIN_M, COARSE_DECAY, START_ITERATIONS)
 
 
 def upright_directions(T_prior: Floats, up: Floats = Z) -> Floats:

@@ -15,7 +15,7 @@ from lslam.core.types.scan_result import StageClock
 from lslam.core.types.state import Stateful
 from lslam.registration.acceptance import Acceptance, correction
 from lslam.registration.history import History
-from lslam.registration.optimiser import KERNEL_DECAY, KERNEL_MIN_M, START_ITERATIONS, Annealing
+from lslam.registration.optimiser import START_ITERATIONS, Annealing
 from lslam.registration.result import RegistrationResult
 
 # Around a pose that is nearly right the kernel opens so wide, and larger corrections of the prior are checked coarse to fine:
@@ -95,7 +95,7 @@ class Attempt:
         steps = c.max_iterations * self.target.times_steps
         if not self.is_near and h.starting > 0:
             steps = START_ITERATIONS
-        return Annealing(width, KERNEL_MIN_M, KERNEL_DECAY, steps)
+        return Annealing(width, steps)
 
     def judge(self, result: RegistrationResult, T_prior: Floats | None = None) -> RegistrationResult:
         """The result with its correction of the prior, or a failed one at the prior with the reason."""

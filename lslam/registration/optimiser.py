@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from lslam.core.arrays import Floats, Ints, Longs
-from lslam.core.geometry import se3, so3
+from lslam.core.geometry import se3
 from lslam.core.kernels import linearisation as at
 from lslam.core.kernels.gauss_newton import UNSEEN_SHARE, step, step_on_surfaces, trimming_distance2
 from lslam.core.types.scan import LEVER_M
@@ -35,9 +35,19 @@ class Annealing:
     """Widths of the Geman-McClure kernel, m: from `start` times `decay` per step down to `end`, `steps` at most."""
 
     start: float
-    end: float
-    decay: float
     steps: int
+    end: float = KERNEL_MIN_M
+    decay: float = KERNEL_DECAY
+
+    @classmethod
+    def slow(cls, width: float) -> Annealing:
+        """From `width`, m, so slowly that coarse planes are followed."""
+        return cls(width, START_ITERATIONS, decay=COARSE_DECAY)
+
+    @classmethod
+    def once(cls, width: float) -> Annealing:
+        """One step at `width`, m."""
+        return cls(width, 1, width)
 
 
 class Correspondences:
@@ -100,13 +110,13 @@ class Limits:
     directions: Floats = field(default_factory=lambda: EVERYWHERE)
 
 
-def pose_change(pose: Floats, reference: Floats) -> Floats:
-    """(6,) d of t = t' + d[:3], R = exp(d[3:]) R' from a reference pose (4, 4) to another, as the steps are."""
-    return np.concatenate([pose[:3, 3] - reference[:3, 3], so3.log(pose[:3, :3] @ reference[:3, :3].T)])
+@dataclass(frozen=True)
+class Problem:
+    """Terms that share their `matches`, and the pose `T_start` (4, 4) to begin with.
 
-
-class Problem(NamedTuple):
-    """What `optimise` solves, and from where: its arguments."""
+    inlier_distance : m, beyond which correspondences are rejected
+    inlier_ratio : from the second step on those are rejected, too, that lie farther than so many of the last step's
+    """
 
     terms: Sequence[Term]
     T_start: Floats
@@ -117,21 +127,12 @@ class Problem(NamedTuple):
     inlier_ratio: float = 1.0
 
 
-def optimise(
-    terms: Sequence[Term],
-    T_start: Floats,
-    annealing: Annealing,
-    limits: Limits,
-    matches: Correspondences,
-    inlier_distance: float = np.inf,
-    inlier_ratio: float = 1.0,
-) -> RegistrationResult:
-    """Step from `T_start` (4, 4) until, at the kernel's end width, a step is below `STEP_M` and `STEP_RAD`.
+def optimise(problem: Problem) -> RegistrationResult:
+    """Step from the start until, at the kernel's end width, a step is below `STEP_M` and `STEP_RAD`.
 
-    Every step linearises all terms anew, in their order: on several maps the finest first. Correspondences beyond
-    `inlier_distance`, m, are rejected, and from the second step on those of `matches` beyond the distance within which the
-    nearest `inlier_ratio` of the last step's lay.
+    Every step linearises all terms anew, in their order: on several maps the finest first.
     """
+    T_start, annealing, limits, matches = problem.T_start, problem.annealing, problem.limits, problem.matches
     pose = np.ascontiguousarray(T_start[:3, :3], np.float64).copy(), np.array(T_start[:3, 3], np.float64)
     # One buffer, so that one call clears it.
     buffer = np.zeros(78 + at.COUNT)
@@ -140,14 +141,14 @@ def optimise(
     bounds = (float(limits.weak_share), float(limits.least), float(limits.unseen))
     advance = step_on_surfaces if limits.by_surfaces else step
     scale, end = float(annealing.start), float(annealing.end)
-    farthest2 = gate2 = float(inlier_distance) ** 2
+    farthest2 = gate2 = float(problem.inlier_distance) ** 2
     iterations, converged = 0, False
     while iterations < annealing.steps and not converged:
         iterations += 1
         buffer.fill(0.0)
         matches.clear()
         width = (scale, end, gate2)
-        for term in terms:
+        for term in problem.terms:
             term.linearise(term.points, term.target, term.settings, term.search, pose, width, sums)
         if facts[at.MATCHED] < len(d):
             break
@@ -156,8 +157,8 @@ def optimise(
             break
         converged = scale <= end and move < STEP_M and turn < STEP_RAD
         scale = max(scale * annealing.decay, end)
-        if inlier_ratio < 1.0:
-            gate2 = trimming_distance2(matches.away2, float(inlier_ratio), farthest2)
+        if problem.inlier_ratio < 1.0:
+            gate2 = trimming_distance2(matches.away2, float(problem.inlier_ratio), farthest2)
     weak = weak[:count]
     if len(limits.directions):
         weak = weak[np.linalg.norm(weak @ limits.directions, axis=1) > 0.5]

@@ -5,7 +5,7 @@ The search for the start is one: at the first steps nothing is known yet of how 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -77,7 +77,7 @@ class NonGroundPoints:
         At the wrong height, or tilted by a degree, rings agree with those of another scan that hit something else.
         """
         level = np.eye(6) - upright_directions(T_start, self._up)
-        annealing = Annealing(START_STEP_M, NEAR_M / 2, 0.7, 20)
+        annealing = Annealing(START_STEP_M, 20, NEAR_M / 2, 0.7)
         return solve((self._cells,), high, T_start, annealing, ALL_ALIKE, residual=MEANS, directions=level)
 
 
@@ -139,7 +139,7 @@ def best_by_non_ground(
     def upright(pose: Floats) -> Floats:
         directions = upright_directions(pose, up_of(target.preprocess))
         problem = target.problem(flat, pose, RECOVER_M, START_ITERATIONS, coarser, directions)
-        return optimise(*problem).T_world_lidar
+        return optimise(problem).T_world_lidar
 
     def agreeing(at: RegistrationResult) -> Bools:
         return non_ground.agreeing(high, at.T_world_lidar)
@@ -155,7 +155,7 @@ def best_by_non_ground(
     margin = CLEAR_RATIO if is_at_rest(result.T_world_lidar, last) else MUCH_RATIO
     if is_drawn or not is_much_more(most, agreeing(result), margin):
         return result
-    near = optimise(*target.problem(points, place, RECOVER_M, START_ITERATIONS, target.coarse_maps(points, place)))
+    near = optimise(target.problem(points, place, RECOVER_M, START_ITERATIONS, target.coarse_maps(points, place)))
     judged = attempt.judge(near, place)
     if not judged.ok and not result.ok:
         return result
@@ -170,7 +170,7 @@ def _best_start(
     """The best of several starts: a few points on the coarse map show which are worth a whole registration."""
     target, count = attempt.target, len(high.source)
     coarse_map, few = target.coarse_maps(attempt.points, attempt.T_prior)[0], few_of(attempt.points)
-    slow = target.slowly(2 * START_STEP_M)
+    slow = Annealing.slow(2 * START_STEP_M)
     trials = [
         solve((coarse_map,), few, attempt.T_prior @ se3.make(np.eye(3), offset), slow, attempt.config)
         for offset in start_offsets(attempt.config.start_reach, START_STEP_M, up_of(target.preprocess))
@@ -274,15 +274,11 @@ class AtRest:
         return attempt.credit(result.with_pose(rest.T_world_lidar.copy(), result.covariance), self.name)
 
 
-def policies_of(config: RecoveryConfig, of_features: Sequence[Policy] | None = None) -> tuple[Policy, ...]:
-    """Nearest first: a policy sees what those before it found.
-
-    of_features : what features have in place of the search for the start; None: for points
-    """
-    is_of_points = of_features is None
-    return (
-        *([CoarseToFine(not is_of_points)] if config.coarse_to_fine else []),
-        *([StartSearch()] if is_of_points and config.start_search else []),
-        *(of_features or ()),
-        *([AtRest()] if config.at_rest else []),
+def policies_of(config: RecoveryConfig) -> tuple[Policy, ...]:
+    """Policies of points that are switched on, nearest first: each sees what those before it found."""
+    switches: tuple[tuple[bool, Policy], ...] = (
+        (config.coarse_to_fine, CoarseToFine()),
+        (config.start_search, StartSearch()),
+        (config.at_rest, AtRest()),
     )
+    return tuple(policy for is_on, policy in switches if is_on)

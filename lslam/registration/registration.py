@@ -20,7 +20,7 @@ from lslam.registration.acceptance import failure
 from lslam.registration.attempt import Attempt, Policy, Target
 from lslam.registration.history import History
 from lslam.registration.local_map import LocalMap
-from lslam.registration.optimiser import KERNEL_DECAY, KERNEL_MIN_M, Annealing
+from lslam.registration.optimiser import KERNEL_MIN_M, Annealing
 from lslam.registration.policies import policies_of
 from lslam.registration.preprocessing.prepare import prepare_points
 from lslam.registration.rest import RestDetector
@@ -138,9 +138,8 @@ class Registration(Stateful):
         It has the scale of the scene, the voxels and the noise in it: a share of 16 % is right in a small room, and wrong in a
         street.
         """
-        at_once = Annealing(KERNEL_MIN_M, KERNEL_MIN_M, KERNEL_DECAY, 1)
         attempt = self.attempt(result.points, result.T_world_lidar)
-        return float(self.target.align(attempt, result.T_world_lidar, at_once).inlier_share)
+        return float(self.target.align(attempt, result.T_world_lidar, Annealing.once(KERNEL_MIN_M)).inlier_share)
 
     def enter(self, result: RegistrationResult) -> None:
         """Insert the scan into the map at its pose unless its registration failed.

@@ -12,14 +12,12 @@ from numpy.typing import NDArray
 
 from lslam.core.arrays import Bools, Floats, Longs
 from lslam.core.config.input import PreprocessConfig
-from lslam.core.geometry import se3
-from lslam.core.geometry.noise import RIGHT_PROBABILITY, quantile
+from lslam.core.geometry import noise, se3
 from lslam.core.kernels.linearisation import OUTLIER_SIGMAS
 from lslam.core.types.state import Stateful
 from lslam.registration.alignment import upright_directions
 from lslam.registration.gaussian_map import FLOOR_M2
 from lslam.registration.local_map import COARSE_FACTOR, LEAST_BREADTH
-from lslam.registration.optimiser import pose_change
 from lslam.registration.preprocessing.ground import ground_of, up_of
 from lslam.registration.result import RegistrationResult
 
@@ -41,7 +39,7 @@ class RestDetector(Stateful):
 
     def __init__(self, sigma: float) -> None:
         self.sigma = sigma
-        self._same_pose_chi2 = quantile(RIGHT_PROBABILITY, 6)
+        self._same_pose_chi2 = noise.quantile(noise.RIGHT_PROBABILITY, 6)
         self._reference: Floats | None = None
         # Scans near the reference; scans that it took to leave the one before.
         self._stayed = self._last_stay = 0
@@ -61,7 +59,7 @@ class RestDetector(Stateful):
         C, T, reference = result.covariance, result.T_world_lidar, self._reference
         if reference is None or C is None or not result.is_accepted:
             return False
-        d = pose_change(T, reference)
+        d = noise.changes(reference, T)
         if d[:3] @ d[:3] + result.lever_arm**2 * (d[3:] @ d[3:]) > self.sigma**2:
             return False
         # Once in a thousand scans two poses of one place differ by more.
@@ -194,7 +192,7 @@ class Rest(Stateful):
 
     def _away(self, T_world_lidar: Floats, lever_arm: float) -> float:
         """m from the spot to a pose (4, 4), but for height and tilt, for a point at the `lever_arm`, m."""
-        change = pose_change(T_world_lidar, self.T_world_lidar)
+        change = noise.changes(self.T_world_lidar, T_world_lidar)
         level = change - upright_directions(self.T_world_lidar, up_of(self.preprocess)) @ change
         return float(np.linalg.norm(level[:3]) + np.linalg.norm(level[3:]) * lever_arm)
 

@@ -82,7 +82,7 @@ class VoxelTarget(MapAlignment, Target):
     ) -> RegistrationResult:
         """Align with the map from `T_start` (4, 4); `information` (6, 6) of it as a prior, None: only a start."""
         return optimise(
-            *self.problem(attempt.points, T_start, annealing.start, annealing.steps, information=information)
+            self.problem(attempt.points, T_start, annealing.start, annealing.steps, information=information)
         )
 
     def capture(self, attempt: Attempt) -> RegistrationResult:
@@ -95,7 +95,7 @@ class VoxelTarget(MapAlignment, Target):
         covariance = np.zeros((1, 6)) if self.kind.needs_covariance else None
         gaps = np.zeros(1) if self.kind.needs_gaps else None
         points = replace(points, covariance=covariance, gaps=gaps)
-        optimise(*self.problem(points, np.eye(4), KERNEL_MIN_M, 1))
+        optimise(self.problem(points, np.eye(4), KERNEL_MIN_M, 1))
 
     def enter(self, result: RegistrationResult) -> None:
         """Insert a scan at its pose."""

@@ -43,7 +43,7 @@ from lslam.simulation.scenarios import simulate
 Floats = NDArray[np.float64]
 COUNT = 24
 SPAN = Span(0.0, 0.1)
-ANNEALING = Annealing(1.0, 0.15, 0.5, 20)
+ANNEALING = Annealing(1.0, 20)
 
 
 def method(name: str, *settings: str) -> Odometry:

@@ -37,7 +37,7 @@ Floats = NDArray[np.float64]
 HALF = np.array([9.0, 7.0, 2.0])  # m, of the room
 PILLARS = np.array([[4.0, 3.0], [-5.0, 2.0], [3.0, -4.0], [-4.0, -4.5], [0.5, 5.0]])
 PILLAR = 0.4  # m, half a side
-ANNEALING = Annealing(1.0, 0.15, 0.5, 30)
+ANNEALING = Annealing(1.0, 30)
 NOISE = FeatureNoise(0.15, 0.03, 1e-3)
 
 

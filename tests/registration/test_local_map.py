@@ -105,7 +105,7 @@ def test_cached_correspondences_are_discarded_when_the_map_changes() -> None:
     alignment, points = MapAlignment(target, config), scan(1)
 
     def align(by: MapAlignment, x: float) -> list[float]:
-        found = optimise(*by.problem(points, pose_at((x, 0.0, 0.0)), 0.5, 10))
+        found = optimise(by.problem(points, pose_at((x, 0.0, 0.0)), 0.5, 10))
         return [*found.T_world_lidar.ravel(), found.rmse, found.matched]
 
     for x in (0.1, 0.05):

@@ -20,7 +20,7 @@ from lslam.core.kernels.linearisation import Floats, Pose, Search, Settings, Sum
 from lslam.core.kernels.residuals import Voxels, add_row, nearest, octant_slots
 from lslam.registration.alignment import solve, voxel_terms
 from lslam.registration.gaussian_map import GaussianMap
-from lslam.registration.optimiser import Annealing, Correspondences, Limits, Term, optimise
+from lslam.registration.optimiser import Annealing, Correspondences, Limits, Problem, Term, optimise
 from lslam.registration.preprocessing.prepare import PreparedPoints
 from lslam.registration.registration import Registration
 from lslam.registration.residuals import RESIDUALS, ResidualKind, find_residual
@@ -51,9 +51,8 @@ def align(
 ) -> RegistrationResult:  # fmt: skip
     matches = Correspondences(len(source))
     terms = voxel_terms(RESIDUALS["plane"], (source, np.zeros((len(source), 6))), [m], matches, 0.03)
-    return optimise(
-        terms, se3.make(R, t), Annealing(width, 0.1, 0.5, steps), Limits(weak_share), matches, inlier_distance=farthest
-    )
+    annealing = Annealing(width, steps, 0.1)
+    return optimise(Problem(terms, se3.make(R, t), annealing, Limits(weak_share), matches, inlier_distance=farthest))
 
 
 def test_known_transforms_are_found_again(target: GaussianMap) -> None:
@@ -143,7 +142,7 @@ def test_the_facts_are_named() -> None:
         sums[3][places] += [4.0, 9.0, 20.0, 30.0, 16.0, 1.0]
 
     term = Term(sum_up, (), (), ())
-    facts = optimise([term, term], np.eye(4), Annealing(1.0, 1.0, 0.5, 1), Limits(1e-3), Correspondences(0))
+    facts = optimise(Problem([term, term], np.eye(4), Annealing.once(1.0), Limits(1e-3), Correspondences(0)))
     assert (facts.inliers, facts.matched) == (40, 60)
     assert facts.lever_arm == 2.0
     assert facts.rmse == 3.0
@@ -169,7 +168,7 @@ def test_each_map_serves_what_the_finer_ones_left(residual: str) -> None:
 
     def found(count: int) -> RegistrationResult:
         return solve(
-            levels[:count], scan, np.eye(4), Annealing(1.0, 0.15, 0.7, 40), RegistrationConfig(),
+            levels[:count], scan, np.eye(4), Annealing(1.0, 40, decay=0.7), RegistrationConfig(),
             residual=replace(find_residual(residual), blob_weight=0.0),
         )  # fmt: skip
 
@@ -193,7 +192,7 @@ def test_no_point_is_matched_on_two_maps(residual: str) -> None:
         level.insert(seen(), np.eye(4))
     scan = as_source(seen()[::20])
     result = solve(
-        levels, scan, np.eye(4), Annealing(0.15, 0.15, 0.5, 5), RegistrationConfig(), residual=find_residual(residual)
+        levels, scan, np.eye(4), Annealing(0.15, 5), RegistrationConfig(), residual=find_residual(residual)
     )  # fmt: skip
     assert 0 < result.inliers <= result.matched <= result.source_points
 

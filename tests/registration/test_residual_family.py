@@ -62,7 +62,7 @@ def test_the_coarse_map_alone_brings_a_start_near(residual: Residual) -> None:
         T = pose_at((0.8, 0.6, 0.0), 3.0)
         registration = in_room(residual, seed)
         points = prepare_points(seen_from(room(rng), T), registration.preprocess)
-        slow = Annealing(5.0, 0.15, 0.85, 40)
+        slow = Annealing.slow(5.0)
         coarse = registration.map.coarser[0]
         found = solve((coarse,), points, np.eye(4), slow, RegistrationConfig(), residual=find_residual(residual))
         assert distance(T, found.T_world_lidar)[0] < 0.1

@@ -35,7 +35,7 @@ from lslam.registration.result import RegistrationResult
 Floats = NDArray[np.float64]
 # Of the points of a room.
 LEVER_ARM_M = 8.0
-FINE = Annealing(1.0, 0.15, 0.5, 20)
+FINE = Annealing(1.0, 20)
 
 
 def as_source(points: NDArray[np.float32]) -> PreparedPoints:
@@ -152,7 +152,7 @@ def test_a_degenerate_direction_is_estimated_down_to_three_tenths_of_the_thresho
     start = pose_at((0.05, 0.0, 0.0))
 
     def solved(weak_share: float) -> RegistrationResult:
-        annealing = Annealing(0.3, 0.3, 0.5, 20)
+        annealing = Annealing(0.3, 20, 0.3)
         config = RegistrationConfig(sigma=NOISE, weak_share=weak_share)
         return solve((target,), seen, start, annealing, config, residual=PLANES_ALONE)
 

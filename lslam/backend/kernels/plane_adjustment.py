@@ -130,12 +130,11 @@ def across(n: Floats, C: Floats, out: Floats) -> None:
         out[2, k] = n[1] * C[0, k] - n[0] * C[1, k]
 
 
-@inline_with_arrays
-def lever(n: Floats, mean: Floats, origin: Floats, out: Floats) -> None:
-    """Effect (6,) of a pose's correction on the distance of a point `mean` from a plane of normal `n`."""
-    x, y, z = mean[0] - origin[0], mean[1] - origin[1], mean[2] - origin[2]
-    out[0], out[1], out[2] = n[0], n[1], n[2]
-    out[3], out[4], out[5] = y * n[2] - z * n[1], z * n[0] - x * n[2], x * n[1] - y * n[0]
+@inline
+def lever(n: Floats, means: Floats, c: int, origins: Floats, k: int) -> tuple[float, float, float]:
+    """Effect of the turn of pose `k` about each axis on the distance of the mean of sighting `c` from a plane of normal `n`."""
+    x, y, z = means[c, 0] - origins[k, 0], means[c, 1] - origins[k, 1], means[c, 2] - origins[k, 2]
+    return y * n[2] - z * n[1], z * n[0] - x * n[2], x * n[1] - y * n[0]
 
 
 @inline
@@ -156,10 +155,10 @@ def couple(
         if share == 0.0:
             continue
         k = poses[c] + side
-        dx, dy, dz = means[c, 0] - origins[k, 0], means[c, 1] - origins[k, 1], means[c, 2] - origins[k, 2]
+        roll, pitch, yaw = lever(n, means, c, origins, k)
         a, b, d = x[k, 3], x[k, 4], x[k, 5]
         r = n[0] * x[k, 0] + n[1] * x[k, 1] + n[2] * x[k, 2]
-        r += (dy * n[2] - dz * n[1]) * a + (dz * n[0] - dx * n[2]) * b + (dx * n[1] - dy * n[0]) * d
+        r += roll * a + pitch * b + yaw * d
         z[0] += share * r
         z[1] += share * (r * slopes[c, 0] + slopes[c, 2] * a + slopes[c, 3] * b + slopes[c, 4] * d)
         z[2] += share * (r * slopes[c, 1] + slopes[c, 5] * a + slopes[c, 6] * b + slopes[c, 7] * d)
@@ -184,13 +183,10 @@ def couple_back(
         if share == 0.0:
             continue
         k = poses[c] + side
-        dx, dy, dz = means[c, 0] - origins[k, 0], means[c, 1] - origins[k, 1], means[c, 2] - origins[k, 2]
-        f = share * force
+        arms, f = lever(n, means, c, origins, k), share * force
         for a in range(3):
             out[k, a] -= f * n[a]
-        out[k, 3] -= f * (dy * n[2] - dz * n[1]) + share * (slopes[c, 2] * y[1] + slopes[c, 5] * y[2])
-        out[k, 4] -= f * (dz * n[0] - dx * n[2]) + share * (slopes[c, 3] * y[1] + slopes[c, 6] * y[2])
-        out[k, 5] -= f * (dx * n[1] - dy * n[0]) + share * (slopes[c, 4] * y[1] + slopes[c, 7] * y[2])
+            out[k, 3 + a] -= f * arms[a] + share * (slopes[c, 2 + a] * y[1] + slopes[c, 5 + a] * y[2])
 
 
 @kernel
@@ -271,7 +267,8 @@ def equations(
                 k = poses[c] + side
                 if share == 0.0:
                     continue
-                lever(n, means[c], origins[k], J[side])
+                J[side, 0], J[side, 1], J[side, 2] = n[0], n[1], n[2]
+                J[side, 3], J[side, 4], J[side, 5] = lever(n, means, c, origins, k)
                 f = weight * share
                 for i in range(6):
                     g[k, i] += f * J[side, i] * r

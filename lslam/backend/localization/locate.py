@@ -307,10 +307,10 @@ class MapFollower(Stateful):
         width = max(self._uncertainty_m(), RECOVER_M)
         if start is self.T and width <= c.kernel_max:
             information = np.asarray(np.linalg.inv(self.covariance), np.float64)
-            return optimise(*alignment.problem(points, start, width, c.max_iterations, information=information))
+            return optimise(alignment.problem(points, start, width, c.max_iterations, information=information))
         if start is self.T:
             start = alignment.coarse_to_fine(points, start, width).T_world_lidar
-        return optimise(*alignment.problem(points, start, c.kernel_max, c.max_iterations))
+        return optimise(alignment.problem(points, start, c.kernel_max, c.max_iterations))
 
     def _judge(self, result: RegistrationResult) -> tuple[FixStatus, str]:
         """Status of a registered scan (held, changed or beyond the map) and the reason of the latter two."""

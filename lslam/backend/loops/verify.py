@@ -26,7 +26,7 @@ from lslam.core.types.constraint import LoopStage
 from lslam.registration.acceptance import Acceptance
 from lslam.registration.alignment import solve
 from lslam.registration.gaussian_map import GaussianMap
-from lslam.registration.optimiser import COARSE_DECAY, KERNEL_DECAY, KERNEL_MIN_M, Annealing
+from lslam.registration.optimiser import COARSE_DECAY, KERNEL_MIN_M, Annealing
 from lslam.registration.preprocessing.prepare import PreparedPoints, thin
 from lslam.registration.result import RegistrationResult
 
@@ -123,25 +123,22 @@ class SubmapRegistration:
     def support(self, b: LevelSubmap, T_a_b: Floats, cells: VisibleCells) -> float:
         """Inlier share among the upright points in the cells: unlike their number, it does not depend on the shift."""
         comparable = cells.count(se3.apply(T_a_b, b.upright.source))
-        width = 2 * KERNEL_MIN_M
-        inliers = self._solve(b.upright, T_a_b, Annealing(width, width, 0.5, 1)).inliers
+        inliers = self._solve(b.upright, T_a_b, Annealing.once(2 * KERNEL_MIN_M)).inliers
         return inliers / comparable if comparable else 0.0
 
     def refine(self, b: LevelSubmap, start: Floats) -> RegistrationResult:
         """All source points of b registered from the pose of a trial."""
-        r = self.registration
-        annealing = Annealing(r.kernel_max, KERNEL_MIN_M, KERNEL_DECAY, self.config.max_iterations)
-        return self._solve(b.source, start, annealing)
+        return self._solve(b.source, start, Annealing(self.registration.kernel_max, self.config.max_iterations))
 
     def match(self, b: LevelSubmap, T_a_b: Floats) -> RegistrationResult:
         """The residuals of b at a pose, within `JUDGED` m."""
-        return self._solve(b.source, T_a_b, Annealing(JUDGED, JUDGED, 0.5, 1))
+        return self._solve(b.source, T_a_b, Annealing.once(JUDGED))
 
     def _try(self, b: LevelSubmap, guess: Floats, cells: VisibleCells) -> Trial:
         r, few = self.registration, thin(b.source, FEW)
-        slow = Annealing(CATCH, r.kernel_max / 2, COARSE_DECAY, self.config.max_iterations)
+        slow = Annealing(CATCH, self.config.max_iterations, r.kernel_max / 2, COARSE_DECAY)
         coarse = self._solve(few, guess, slow, self.a.coarse)
-        T = self._solve(few, coarse.T_world_lidar, Annealing(r.kernel_max, KERNEL_MIN_M, 0.7, 15)).T_world_lidar
+        T = self._solve(few, coarse.T_world_lidar, Annealing(r.kernel_max, 15, decay=0.7)).T_world_lidar
         return Trial(self.support(b, T, cells), T)
 
     def _solve(

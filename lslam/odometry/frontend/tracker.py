@@ -14,7 +14,7 @@ from lslam.core.geometry import se3, so3
 from lslam.core.types.imu import ImuDiagnostics
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import LEVER_M, Scan, Span
-from lslam.core.types.scan_result import ScanResult, StageClock, Status
+from lslam.core.types.scan_result import ScanResult, StageClock, Status, sum_stages
 from lslam.core.types.state import State, Stateful
 from lslam.odometry.base import Deskewing, Odometry, Registering, Resumable, WindowMethod
 from lslam.odometry.inertial.constant_velocity import ConstantVelocity, MotionModel, middle_of
@@ -295,7 +295,7 @@ def _nearest(
 
 def _both(first: RegistrationResult, second: RegistrationResult) -> RegistrationResult:
     """The second registration of a scan, with the iterations and times of both."""
-    stages = {name: first.stages.get(name, 0.0) + second.stages.get(name, 0.0) for name in first.stages | second.stages}
+    stages = sum_stages([first.stages, second.stages])
     return replace(second, iterations=first.iterations + second.iterations, stages=stages)
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from lslam.core.arrays import Floats
 from lslam.core.geometry import noise, se3
 from lslam.core.types.motion_prior import MotionPrior
-from lslam.core.types.scan_result import ScanResult
+from lslam.core.types.scan_result import ScanResult, sum_stages
 from lslam.core.types.state import State, Stateful
 from lslam.odometry.base import Deskewing, Resumable
 from lslam.odometry.frontend.segments import SegmentTracker, TrackedScan
@@ -274,7 +274,7 @@ class WindowTracker(Stateful):
         pose, covariance = first_pose(used, initial_scans, create)
         before = used[0].result.T_world_lidar
         self._world = se3.normalise(before @ se3.inverse(pose))
-        stages = _sum(tracks[0].result.stages, {"register": time.perf_counter() - began})
+        stages = sum_stages([tracks[0].result.stages, {"register": time.perf_counter() - began}])
         out = [replace(tracks[0], result=replace(tracks[0].result, stages=stages)), *tracks[1:]]
         if self._rest is None:
             return [], [out[0].at(pose), *out[1:]]
@@ -312,7 +312,8 @@ class WindowTracker(Stateful):
             self._decided += self._tracker.decide(entry, result)
         for k, (track, before) in enumerate(zip(self._decided, earlier, strict=False)):
             now = track.result
-            work = replace(now, stages=_sum(now.stages, before.stages), iterations=now.iterations + before.iterations)
+            stages = sum_stages([now.stages, before.stages])
+            work = replace(now, stages=stages, iterations=now.iterations + before.iterations)
             self._decided[k] = replace(track, result=work)
 
     def _set_course(self, course: Course | None) -> None:
@@ -349,7 +350,3 @@ def _is_more(ours: list[int], others: list[int]) -> bool:
     """Whether more scans have more inliers than have less, at two sigma: points of one scan agree or do not together."""
     won, lost = (sum(sign * (a - b) > 0 for a, b in zip(ours, others, strict=True)) for sign in (1, -1))
     return is_more(won, lost)
-
-
-def _sum(a: dict[str, float], b: dict[str, float]) -> dict[str, float]:
-    return {name: a.get(name, 0.0) + b.get(name, 0.0) for name in a | b}

@@ -23,7 +23,6 @@ from lslam.odometry.inertial.gyroscope import INNOVATION_SIGMAS, MOUNTING, OFFSE
 from lslam.odometry.inertial.imu_estimate import GRAVITY_SIGMA_M_S2, GRAVITY_WALK, PLACE_SIGMA, TURN_SIGMA, ImuEstimate
 from lslam.odometry.inertial.integrate import Increments
 from lslam.odometry.kernels import kalman
-from lslam.registration.optimiser import pose_change
 from lslam.registration.result import RegistrationResult
 
 PLACE, TURN, SPEED, DOWN, FORCE = (slice(3 * k, 3 * k + 3) for k in range(5))
@@ -168,7 +167,7 @@ class NavigationState:
         """The state after its pose became `T_world_imu` (4, 4) with `covariance` (6, 6); the rest follows by its correlation."""
         P = self.covariance
         gain = np.linalg.solve(P[POSE, POSE], P[POSE]).T
-        d = pose_change(T_world_imu, self.T_world_imu)
+        d = noise.changes(self.T_world_imu, T_world_imu)
         P = P - gain @ (P[POSE, POSE] - covariance) @ gain.T
         state = self._shift(gain @ d, 0.5 * (P + P.T))._with_gravity()
         return replace(state, T_world_imu=T_world_imu)._share_covariance()

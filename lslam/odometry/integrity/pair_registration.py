@@ -22,14 +22,12 @@ from lslam.registration.alignment import voxel_terms
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.local_map import COARSE_FACTOR, LEAST_BREADTH, WIDE_FACTORS
 from lslam.registration.optimiser import (
-    COARSE_DECAY,
     COARSE_KERNEL_M,
-    KERNEL_DECAY,
     KERNEL_MIN_M,
-    START_ITERATIONS,
     Annealing,
     Correspondences,
     Limits,
+    Problem,
     Term,
     optimise,
 )
@@ -159,18 +157,18 @@ class PairRegistration:
     def near(self, start: Floats) -> MotionHypothesis:
         """The motion that fits near a start (4, 4): planes capture points as far as they reach."""
         widest = max(CAPTURE_EDGES * self._edge, KERNEL_MIN_M)
-        return self._lay(start, Annealing(widest, KERNEL_MIN_M, KERNEL_DECAY, SETTINGS.max_iterations))
+        return self._lay(start, Annealing(widest, SETTINGS.max_iterations))
 
     def far(self, start: Floats) -> MotionHypothesis:
         """The motion that fits best some metres around a start (4, 4)."""
-        return self._lay(start, Annealing(COARSE_KERNEL_M, KERNEL_MIN_M, COARSE_DECAY, START_ITERATIONS))
+        return self._lay(start, Annealing.slow(COARSE_KERNEL_M))
 
     def at(self, motion: Floats) -> MotionHypothesis:
         """How the scan fits at a motion (4, 4)."""
-        return self._lay(motion, Annealing(KERNEL_MIN_M, KERNEL_MIN_M, KERNEL_DECAY, 1))
+        return self._lay(motion, Annealing.once(KERNEL_MIN_M))
 
     def _lay(self, start: Floats, annealing: Annealing) -> MotionHypothesis:
-        motion = optimise(self._terms, start, annealing, Limits(SETTINGS.weak_share), self._matches)
+        motion = optimise(Problem(self._terms, start, annealing, Limits(SETTINGS.weak_share), self._matches))
         away2 = self._matches.away2
         cells = directions(se3.apply(motion.T_world_lidar, self._source))
         on_planes = (away2 >= 0) & (away2 < KERNEL_MIN_M**2)
