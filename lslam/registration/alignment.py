@@ -13,8 +13,8 @@ import numpy as np
 
 from lslam.core.arrays import Floats
 from lslam.core.config.odometry import RegistrationConfig
+from lslam.core.kernels.gauss_newton import linearise_prior
 from lslam.registration.gaussian_map import GaussianMap
-from lslam.registration.kernels import prior_residual
 from lslam.registration.local_map import LocalMap
 from lslam.registration.optimiser import (
     COARSE_KERNEL_M,
@@ -57,7 +57,7 @@ def solve(
 def prior_term(T_prior: Floats, information: Floats) -> Term:
     """The pose (4, 4) as a measurement, of information (6, 6), world axes, 1/m2 and 1/rad2."""
     R, t = (np.ascontiguousarray(part, np.float64) for part in (T_prior[:3, :3], T_prior[:3, 3]))
-    return Term(prior_residual.linearise, (), (R, t, information), ())
+    return Term(linearise_prior, (), (R, t, information), ())
 
 
 def voxel_terms(

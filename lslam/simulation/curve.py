@@ -22,7 +22,7 @@ def interpolating_spline(x: NDArray[Any], y: NDArray[Any], closed: bool = False)
     """
     from scipy.interpolate import BSpline
 
-    from lslam.simulation.kernels import solve_banded
+    from lslam.core.kernels.linalg import solve_banded
 
     x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)
     if closed:

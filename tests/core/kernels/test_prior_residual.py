@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from lslam.core.geometry import so3
 from lslam.core.kernels import linearisation as at
-from lslam.registration.kernels.prior_residual import linearise
+from lslam.core.kernels.gauss_newton import linearise_prior
 
 Floats = NDArray[np.float64]
 WIDTH = (1.0, 1.0, np.inf)
@@ -31,7 +31,7 @@ def sums_at(R: Floats, t: Floats, target: tuple[Floats, Floats, Floats], populat
     facts = np.zeros(at.COUNT)
     facts[at.MATCHED], facts[at.POPULATION] = 100.0, population
     sums = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6), facts
-    linearise((), target, (), (), (R, t), WIDTH, sums)
+    linearise_prior((), target, (), (), (R, t), WIDTH, sums)
     return sums
 
 
