@@ -42,6 +42,8 @@ log = logging.getLogger("lslam")
 USUAL_SIGMA_M = 5.0
 # m; least sigma of a fix, and by how much heights are worse than positions.
 MIN_SIGMA_M, VERTICAL_RATIO = 0.02, 1.8
+# m; a fix that states more is left out: odometry errs by as much in two kilometres.
+MAX_SIGMA_M = 20.0
 # With fewer fixes that agree there is no georeference.
 MIN_FIXES = 5
 # rad; one sigma of the z axis against up, of a world that nothing levelled and of one levelled by an IMU.
@@ -121,7 +123,7 @@ def place(
     fixes, faults = _on_one_clock(stream, results, arm, level, config)
     if isinstance(fixes, str):
         return Placement(problem=fixes)
-    fixes, faults = with_actual_sigmas(fixes, level, config.gnss.max_sigma, RIGHT_PROBABILITY, faults)
+    fixes, faults = with_actual_sigmas(fixes, level, MAX_SIGMA_M, RIGHT_PROBABILITY, faults)
     alignment, fixes, faults = align_fixes(fixes, direction, sigma, MIN_FIXES, faults)
     if alignment is None:
         return Placement(
@@ -198,17 +200,17 @@ def _on_one_clock(
 def _usable(
     stream: GnssStream, results: Many[ScanResult], arm: Floats, config: GnssConfig, drift: GraphConfig
 ) -> Fixes | str:
-    """The fixes of the run with a position and a sigma of at most `gnss.max_sigma`; or a sentence why there are too few."""
+    """The fixes of the run with a position and a sigma of at most `MAX_SIGMA_M`; or a sentence why there are too few."""
     stamps = np.array([r.stamp_ns for r in results], np.int64)
     stated = np.full(len(stream), config.sigma) if config.sigma is not None else stream.sigma
     stated = np.maximum(np.where(np.isfinite(stated) & (stated > 0), stated, USUAL_SIGMA_M), MIN_SIGMA_M)
     inside = (stream.stamps_ns >= stamps[0]) & (stream.stamps_ns <= stamps[-1])
-    good = inside & stream.is_place & (stated <= config.max_sigma)
+    good = inside & stream.is_place & (stated <= MAX_SIGMA_M)
     count = int(inside.sum())
     if len(stamps) < 2 or good.sum() < MIN_FIXES:
         return (
             f"GNSS: {int(good.sum())} of {len(stream)} fixes were taken during the run, are places and state at most "
-            f"{config.max_sigma:g} m; {MIN_FIXES} are needed"
+            f"{MAX_SIGMA_M:g} m; {MIN_FIXES} are needed"
         )
     poses = np.stack([r.T_world_lidar for r in results])
     at = poses_at(stamps, poses, stream.stamps_ns[good])
@@ -309,7 +311,7 @@ def _fix_noise(
         (fixes.positions - alignment.residuals)[good],
         RIGHT_PROBABILITY,
         drift,
-        config.gnss.max_sigma if fixes.is_overconfident else None,
+        MAX_SIGMA_M if fixes.is_overconfident else None,
     )
     if fix_noise is not None:
         log.info(

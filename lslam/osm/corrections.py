@@ -275,8 +275,8 @@ def map_prior(matches: OsmMatches, config: OsmConfig) -> MapPrior:
 
 def _unseen(config: OsmConfig) -> MapPrior:
     """The prior before any scan."""
-    sigma = np.array([config.building_sigma, config.building_sigma, np.radians(config.building_sigma_deg)])
-    return MapPrior(np.zeros(2), np.maximum(np.full(2, config.shift_sigma), TOGETHER[:2]), sigma)
+    shift_sigma = np.maximum(np.full(2, config.shift_sigma), TOGETHER[:2])
+    return MapPrior(np.zeros(2), shift_sigma, np.array(config.building_sigmas))
 
 
 def write_buildings(folder: Path, corrected_map: CorrectedMap, data: OsmData) -> None:

@@ -97,7 +97,7 @@ def locate(
         start.sigma,
         config.graph.drift_percent,
         np.radians(config.graph.drift_deg_per_100m) / 100,
-        np.array([config.osm.map_sigma, config.osm.map_sigma, np.radians(config.osm.map_sigma_deg)]),
+        np.array(config.osm.map_sigmas),
     )
     matches = _both_ways(run, osm, track, clocks)
     accepted = [match for match in matches if match.is_accepted]

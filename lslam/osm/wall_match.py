@@ -120,7 +120,7 @@ def find_heading(
     """
     config = config or OsmConfig()
     # Without a heading the least coverage is larger, and the distance from the prior does not count.
-    config = config.model_copy(update={"translation_weight": 0.0, "min_coverage": MIN_START_COVERAGE})
+    config = config.model_copy(update={"weights": (*config.weights[:2], 0.0), "min_coverage": MIN_START_COVERAGE})
     at, window = np.append(np.asarray(place, np.float64)[:2], 0.0), np.array([radius, radius, np.pi])
     match = _WallSearch(_rows(source), _rows(target), at, window, np.zeros(3), config, by_coverage=False).best()
     return None if match is None or match.rank < 3 or len(match.pairs) < START_WALLS else match
@@ -223,10 +223,11 @@ class _WallSearch:
             return None
         translation = float(np.linalg.norm(pose[:2] - at[:2]))
         farthest = float(np.linalg.norm(self.window[:2]))
+        by_distance, by_coverage, by_translation = config.weights
         fitness = 100.0 * (
-            -config.distance_weight * min(distance / config.max_distance, 1.0)
-            + config.coverage_weight * coverage
-            - config.translation_weight * min(translation / max(farthest, 1e-9), 1.0)
+            -by_distance * min(distance / config.max_distance, 1.0)
+            + by_coverage * coverage
+            - by_translation * min(translation / max(farthest, 1e-9), 1.0)
         )
         information = _at_pose(planar, centre, pose) * (1.0 if rank == 3 else LINE_WEIGHT)
         pairs = np.column_stack([np.flatnonzero(pair >= 0), pair[pair >= 0]])
@@ -308,7 +309,7 @@ def match_buildings(
     found: list[BuildingMatch] = []
     if not len(match.walls):
         return found
-    sigma = np.array([config.building_sigma, config.building_sigma, np.radians(config.building_sigma_deg)])
+    sigma = np.array(config.building_sigmas)
     own = config.of_one_building
     for number in osm.near(pose[:2] - shift, config.use_radius).tolist():
         middle = osm.buildings[number].middle

@@ -16,6 +16,7 @@ from lslam.backend.graph.odometry_constraints import correct_scans
 from lslam.backend.keyframes.store import KeyframeStore
 from lslam.backend.localization.locate import MapFollower, PlaceFinder, Start, StartPrior, mark_doubts
 from lslam.backend.localization.prior_map import LocalView, PlaceSearch, PriorMap
+from lslam.backend.loops.verify import LEAST_SIGMA_DEG, LEAST_SIGMA_M
 from lslam.core.arrays import Bools, Floats
 from lslam.core.config import Config
 from lslam.core.errors import InterruptedRunError, RunFailedError
@@ -227,7 +228,11 @@ def _at_first_scan(
     c, way = config.loops, keyframe.distance
     systematic = np.diag(
         np.repeat(
-            [(0.01 * c.drift_percent * way + c.sigma_m) ** 2, np.deg2rad(c.drift_deg * way / 100 + c.sigma_deg) ** 2], 3
+            [
+                (0.01 * c.drift_percent * way + LEAST_SIGMA_M) ** 2,
+                np.deg2rad(c.drift_deg * way / 100 + LEAST_SIGMA_DEG) ** 2,
+            ],
+            3,
         )
     )
     return T, np.asarray(C + drift_covariance(way, config.graph) + systematic)

@@ -71,7 +71,7 @@ def held(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("osm") / "held"
     done = lslam(
         "run", SAMPLE, "--out", out, "--osm", FOLDER / "map.osm", "--origin", start(4.0, -3.0), "--heading", heading(8.0),
-        "--set", "osm.map_sigma=0.1", "--set", "osm.map_sigma_deg=0.3", *DRIFT, *PART,
+        "--set", "osm.map_sigma=0.1", *DRIFT, *PART,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     return out

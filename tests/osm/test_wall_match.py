@@ -326,10 +326,10 @@ def test_one_building_is_matched_with_the_walls_seen_of_it(shift: tuple[float, f
 
 
 def test_one_building_has_weights_of_its_own() -> None:
-    config = OsmConfig(distance_weight=0.7, building_weights=(1.5, 1.5, 0.1), building_max_distance=1.0)
+    config = OsmConfig(weights=(0.7, 1.0, 0.1), building_weights=(1.5, 1.5, 0.1), building_max_distance=1.0)
     own = config.of_one_building
-    assert (own.distance_weight, own.coverage_weight, own.translation_weight, own.max_distance) == (1.5, 1.5, 0.1, 1.0)
-    assert OsmConfig(distance_weight=0.7).of_one_building == OsmConfig(distance_weight=0.7)
+    assert (own.weights, own.max_distance) == ((1.5, 1.5, 0.1), 1.0)
+    assert OsmConfig(weights=(0.7, 1.0, 0.1)).of_one_building == OsmConfig(weights=(0.7, 1.0, 0.1))
 
 
 def reference(source: Floats, target: Floats, farthest: float, by_coverage: bool) -> tuple[float, float]:
@@ -375,7 +375,7 @@ def test_distance_and_coverage_are_those_of_the_thesis(by_coverage: bool) -> Non
 
 def test_fitness_is_equation_3_4() -> None:
     source, target, pose = scene(1)
-    config = OsmConfig(distance_weight=0.7, coverage_weight=1.3, translation_weight=0.2, max_distance=1.5)
+    config = OsmConfig(weights=(0.7, 1.3, 0.2), max_distance=1.5)
     prior = np.array(pose) + np.array([0.9, -0.4, 0.02])
     match = match_walls(source, target, prior, SIGMA, config)
     assert match is not None

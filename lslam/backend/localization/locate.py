@@ -25,7 +25,7 @@ from lslam.backend.localization.prior_map import (
 )
 from lslam.backend.loops.gating import GATE_SIGMAS, LoopThrottle
 from lslam.backend.loops.level_submap import find_up, level_rotation, make_level_submap, move_points
-from lslam.backend.loops.verify import SubmapRegistration
+from lslam.backend.loops.verify import LEAST_COVARIANCE, SubmapRegistration
 from lslam.core.arrays import Floats
 from lslam.core.config.config import Config
 from lslam.core.geometry import noise, se3, so3
@@ -250,9 +250,6 @@ class MapFollower(Stateful):
         self.way = 0.0
         self.usual = UsualAgreement(config.registration.min_agreement)
         self._gate = quantile(1.0 - CHANCE, 6)
-        c = config.loops
-        # What maps and registrations err by in common from scan to scan.
-        self._floor = np.diag([c.sigma_m**2] * 3 + [np.deg2rad(c.sigma_deg) ** 2] * 3)
 
     def predict(self, before: ScanResult, result: ScanResult) -> None:
         """Predict pose and covariance by odometry's motion from scan `before` to scan `result`."""
@@ -294,7 +291,7 @@ class MapFollower(Stateful):
             return self._propagate(status, reason, result)
         assert result.covariance is not None
         self.usual.observe(result.inlier_share)
-        self.T, self.P, self.way = result.T_world_lidar, result.covariance + self._floor, 0.0
+        self.T, self.P, self.way = result.T_world_lidar, result.covariance + LEAST_COVARIANCE, 0.0
         return MapFix(self.T, self.P, "held", result.overlap, result.inlier_share, (move, turn))
 
     def _align(self, alignment: MapAlignment, points: PreparedPoints, start: Floats) -> RegistrationResult:
@@ -322,7 +319,7 @@ class MapFollower(Stateful):
             return "beyond" if rejection.test in ("solution", "overlap") else "changed", rejection.reason
         d = noise.changes(self.T, result.T_world_lidar)
         # A scan that fits as well as those before has found its place, and odometry is worse than its covariance.
-        is_outlier = float(d @ np.linalg.solve(self.covariance + self._floor, d)) > self._gate
+        is_outlier = float(d @ np.linalg.solve(self.covariance + LEAST_COVARIANCE, d)) > self._gate
         if is_outlier and self.usual.is_less(result.inlier_share):
             move, turn = correction(self.T, result.T_world_lidar)
             return "changed", f"the map would move it by {move:.2f} m and {np.rad2deg(turn):.1f} deg"

@@ -12,6 +12,7 @@ from lslam.backend.keyframes.store import KeyframeStore, mounted_up, submap
 from lslam.backend.localization.locate import PlaceFinder, Start, StartPrior
 from lslam.backend.localization.prior_map import PlaceSearch, make_prior_map
 from lslam.backend.loops.level_submap import move_points
+from lslam.backend.loops.verify import LEAST_SIGMA_DEG, LEAST_SIGMA_M
 from lslam.core.arrays import Floats, Points
 from lslam.core.config.config import Config
 from lslam.core.config.input import PreprocessConfig
@@ -142,8 +143,8 @@ class Chain:
         old = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(before, axis=0), axis=1))])
         way = own + float(old[-1] - old[near])
         c = self.config.loops
-        turn = np.deg2rad(c.sigma_deg) + np.deg2rad(c.drift_deg) / 100 * way
-        move = c.sigma_m + 0.01 * c.drift_percent * way + turn * max(float(np.linalg.norm(T[:3, 3])), way)
+        turn = np.deg2rad(LEAST_SIGMA_DEG) + np.deg2rad(c.drift_deg) / 100 * way
+        move = LEAST_SIGMA_M + 0.01 * c.drift_percent * way + turn * max(float(np.linalg.norm(T[:3, 3])), way)
         return Constraint(last, last + 1, T, np.diag(np.repeat([move**2, turn**2], 3)), "odometry")
 
 

@@ -38,6 +38,9 @@ WIDEST, NARROWEST = 60.0, 40.0
 SHARED_SHARE = 0.25
 # m between two guesses, the least score relative to the best, and how many there are at most.
 STARTS_APART_M, NEARLY, STARTS = 4.0, 0.7, 5
+# A registration of two places is never more certain than this, m and deg: both maps have errors that all their points share.
+LEAST_SIGMA_M, LEAST_SIGMA_DEG = 0.01, 0.02
+LEAST_COVARIANCE: Floats = np.diag(np.repeat([LEAST_SIGMA_M**2, np.deg2rad(LEAST_SIGMA_DEG) ** 2], 3))
 
 
 @dataclass(frozen=True)
@@ -229,10 +232,9 @@ class Verifier:
         if move > c.max_disagreement_m or np.rad2deg(turn) > c.max_disagreement_deg:
             reason = f"old to new and new to old differ by {move:.2f} m and {np.rad2deg(turn):.2f} deg"
             return facts.reject(LoopStage.AGREEMENT, reason)
-        floor = np.diag([c.sigma_m**2] * 3 + [np.deg2rad(c.sigma_deg) ** 2] * 3)
         assert forward.covariance is not None
         disagreement = np.diag([move**2 / 3] * 3 + [turn**2 / 3] * 3)
-        covariance = forward.covariance + floor + disagreement
+        covariance = forward.covariance + LEAST_COVARIANCE + disagreement
         # The mean of both.
         T = se3.exp(-0.5 * gap) @ forward.T_world_lidar
         return Verification(LoopStage.AGREEMENT, "", se3.normalise(T), covariance, facts.rmse, facts.overlap)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal, Self
 
 from pydantic import BeforeValidator, Field, model_validator
@@ -88,8 +89,6 @@ class LoopsConfig(Section):
         0.2, gt=0, description="m; registration of old to new may differ from that of new to old by so much"
     )
     max_disagreement_deg: float = Field(0.5, gt=0, description="deg; likewise for rotation")
-    sigma_m: float = Field(0.01, gt=0, description="m; a loop closure is never more certain than this")
-    sigma_deg: float = Field(0.02, gt=0, description="deg; likewise for rotation")
 
 
 class GraphConfig(Section):
@@ -156,7 +155,16 @@ class GnssConfig(Section):
         "", description="grid (GTX, GeoTIFF) of the geoid that heights of outputs and control points count from"
     )
     sigma: float | None = Field(None, gt=0, description="m; one sigma of a fix; default: what the recording states")
-    max_sigma: float = Field(20.0, gt=0, description="m; fixes that state more are left out")
+
+
+Weight = Annotated[float, Field(ge=0)]
+Weights = tuple[Weight, Weight, Weight]
+# What is a metre off is turned by so much, one sigma: 35 cm over 10 m, for outlines keep their shape better than their place.
+TURN_DEG_PER_M = 2.0
+
+
+def _sigmas(sigma_m: float) -> tuple[float, float, float]:
+    return sigma_m, sigma_m, math.radians(TURN_DEG_PER_M * sigma_m)
 
 
 class OsmConfig(Section):
@@ -206,10 +214,14 @@ class OsmConfig(Section):
         True, description="with --poses: they are laid on the map as a whole and not bent; false: held like odometry"
     )
     shift_sigma: float = Field(2.0, ge=0, description="m; one sigma by which a map may be off as a whole; 0 holds it")
-    map_sigma: float = Field(0.5, gt=0, description="m; one sigma by which a neighbourhood of the map is off by itself")
-    map_sigma_deg: float = Field(1.0, gt=0, description="deg; likewise of its heading")
-    building_sigma: float = Field(1.0, gt=0, description="m; one sigma by which a building of the map is off")
-    building_sigma_deg: float = Field(2.0, gt=0, description="deg; likewise of its heading")
+    map_sigma: float = Field(
+        0.5,
+        gt=0,
+        description="m; one sigma by which a neighbourhood of the map is off by itself, and turned: by 2 deg per m",
+    )
+    building_sigma: float = Field(
+        1.0, gt=0, description="m; one sigma by which a building of the map is off, and turned likewise"
+    )
     server: str = Field(
         "https://overpass-api.de/api/interpreter",
         pattern=r"^https?://\S+$",
@@ -230,10 +242,11 @@ class OsmConfig(Section):
     min_length: float = Field(2.0, gt=0, description="m; shorter walls are left out")
     wall_sigma: float = Field(0.3, gt=0, description="m; one sigma of a wall of the map, drawn by hand from the air")
     max_distance: float = Field(2.0, gt=0, description="m; mean distance of walls that counts as no match (eq. 3.1)")
-    distance_weight: float = Field(1.0, ge=0, description="A of equation 3.1")
-    coverage_weight: float = Field(1.0, ge=0, description="B of equation 3.2")
-    translation_weight: float = Field(0.1, ge=0, description="C of equation 3.3, of the way to the edge of the window")
-    building_weights: tuple[float, float, float] | None = Field(
+    weights: Weights = Field(
+        (1.0, 1.0, 0.1),
+        description="A, B and C of equations 3.1 to 3.3: of distance, of coverage, and of the way to the edge of the window",
+    )
+    building_weights: Weights | None = Field(
         None, description="A, B and C where one building is matched; absent: as where all are"
     )
     building_max_distance: float | None = Field(
@@ -247,11 +260,18 @@ class OsmConfig(Section):
     @property
     def of_one_building(self) -> OsmConfig:
         """The section as the match of a single building takes it: `building_weights`, `building_max_distance`."""
-        keys = ("distance_weight", "coverage_weight", "translation_weight")
-        own: dict[str, float] = dict(zip(keys, self.building_weights or (), strict=False))
-        if self.building_max_distance is not None:
-            own["max_distance"] = self.building_max_distance
-        return self.model_copy(update=own)
+        farthest = self.max_distance if self.building_max_distance is None else self.building_max_distance
+        return self.model_copy(update={"weights": self.building_weights or self.weights, "max_distance": farthest})
+
+    @property
+    def map_sigmas(self) -> tuple[float, float, float]:
+        """One sigma of a neighbourhood of the map: x and y, m, and heading, rad."""
+        return _sigmas(self.map_sigma)
+
+    @property
+    def building_sigmas(self) -> tuple[float, float, float]:
+        """Likewise of a building."""
+        return _sigmas(self.building_sigma)
 
     @property
     def needs_labels(self) -> bool:

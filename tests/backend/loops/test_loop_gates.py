@@ -190,12 +190,12 @@ def agree(gap: tuple[float, ...], **settings: float) -> Verification:
 
 def test_a_closure_is_the_mean_of_both_registrations_with_their_difference_as_sigma() -> None:
     gap = (0.12, -0.06, 0.04, 0.0, 0.003, -0.004)
-    closure = agree(gap, sigma_m=0.03, sigma_deg=0.1)
+    closure = agree(gap)
     assert (closure.stage, closure.reason) == ("agreement", "")
     assert closure.T_a_b is not None
     assert closure.covariance is not None
     np.testing.assert_allclose(closure.T_a_b, se3.exp(-0.5 * np.array(gap)) @ FORWARD.T_world_lidar, rtol=0, atol=1e-12)
-    expected = [1e-4 + 0.03**2 + 0.14**2 / 3] * 3 + [1e-6 + np.deg2rad(0.1) ** 2 + 0.005**2 / 3] * 3
+    expected = [1e-4 + 0.01**2 + 0.14**2 / 3] * 3 + [1e-6 + np.deg2rad(0.02) ** 2 + 0.005**2 / 3] * 3
     np.testing.assert_allclose(closure.covariance, np.diag(expected), rtol=1e-6, atol=1e-12)
 
 
