@@ -121,7 +121,7 @@ def solve_on_map(
         (edges,),
         (lines.moments, lines.keys, lines.table, *target.lines),
         (float(lines.size), float(noise.edge) ** 2, float(MIN_LINE_POINTS), FLOOR_M2),
-        (*slots_of(len(edges)), matches.away2[len(planes) :]),
+        (*slots_of(len(edges)), matches.distance2[len(planes) :]),
     )
     on_planes = voxel_terms(PLANES_ALONE, (planes, scatter), levels or target.planes.levels, matches, noise.plane)
     limits = Limits(noise.weak_share, noise.least / noise.plane**2, unseen=1.0)

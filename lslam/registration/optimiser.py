@@ -58,23 +58,23 @@ class Correspondences:
 
     def __init__(self, count: int) -> None:
         self.is_done = np.zeros(count, np.bool_)
-        self.away2 = np.full(count, -1.0)
+        self.distance2 = np.full(count, -1.0)
         self._looked_up: dict[object, tuple[Any, ...]] = {}
 
     def __len__(self) -> int:
-        return len(self.away2)
+        return len(self.distance2)
 
     def clear(self) -> None:
         """Nothing is matched."""
         self.is_done.fill(False)
-        self.away2.fill(-1.0)
+        self.distance2.fill(-1.0)
 
     def search(self, target: object = None) -> tuple[Any, ...]:
         """The state of a residual's search in one map, see `kernels.linearisation`."""
         if target not in self._looked_up:
             count = len(self)
             self._looked_up[target] = (*slots_of(count), np.empty((count, 2), np.int32), np.empty((count, 4)))
-        return *self._looked_up[target], self.is_done, self.away2
+        return *self._looked_up[target], self.is_done, self.distance2
 
 
 def slots_of(count: int) -> tuple[Longs, Ints]:
@@ -158,7 +158,7 @@ def optimise(problem: Problem) -> RegistrationResult:
         converged = scale <= end and move < STEP_M and turn < STEP_RAD
         scale = max(scale * annealing.decay, end)
         if problem.inlier_ratio < 1.0:
-            gate2 = trimming_distance2(matches.away2, float(problem.inlier_ratio), farthest2)
+            gate2 = trimming_distance2(matches.distance2, float(problem.inlier_ratio), farthest2)
     weak = weak[:count]
     if len(limits.directions):
         weak = weak[np.linalg.norm(weak @ limits.directions, axis=1) > 0.5]

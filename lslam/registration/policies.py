@@ -65,7 +65,7 @@ class NonGroundPoints:
         matches = Correspondences(len(high.source))
         terms = voxel_terms(MEANS, MEANS.points(high, NEAR_M), (self._cells,), matches, NEAR_M)
         normal_equations(terms, T_world_lidar, NEAR_M, matches)
-        return (matches.away2 >= 0) & (matches.away2 < NEAR_M**2)
+        return (matches.distance2 >= 0) & (matches.distance2 < NEAR_M**2)
 
     def share(self, high: PreparedPoints, T_world_lidar: Floats) -> float:
         """Which part of them does."""

@@ -51,11 +51,11 @@ def _shapes(target: GaussianMap) -> Arrays:
     return target.shapes(), target.keys, target.table
 
 
-# The mean of a blob lies where rings do, which it stands across: along the sensor's axis it is known to a ring's gap, five
-# or six times worse than the points scatter.
+# The mean of a non-planar voxel lies where rings do, which it stands across: along the sensor's axis it is known to a ring's
+# gap, five or six times worse than the points scatter.
 WEIGHT_ALONG_AXIS = 0.03
 # Weight of voxels that are no plane: they know less than they say.
-BLOB_WEIGHT = 0.5
+NON_PLANAR_WEIGHT = 0.5
 
 
 @dataclass(frozen=True)
@@ -67,8 +67,8 @@ class ResidualKind:
     voxels : what it takes of a map
     by_surfaces : whether S of its sums tells which directions are observed: its matrices are full
     is_wide : whether voxels of the wide levels tell it something: a mean does not
-    blob_weight : of voxels that are no plane; 0 leaves them out
-    along : of a blob's weight, along the sensor's axis
+    non_planar_weight : of voxels that are no plane; 0 leaves them out
+    axial_weight : part of that weight along the sensor's axis
     voxel_share : of the voxel size: a voxel's mean stands for one point of its surface, its plane for all
     times_steps : of the steps: a point is drawn to where its match is, not to where the surfaces meet, and the score of a
         normal distribution has no pull on points a few sigma away, so that those near by turn the sensor a little with each
@@ -80,8 +80,8 @@ class ResidualKind:
     voxels: Callable[[GaussianMap], Arrays] = _planes
     by_surfaces: bool = False
     is_wide: bool = True
-    blob_weight: float = BLOB_WEIGHT
-    along: float = WEIGHT_ALONG_AXIS
+    non_planar_weight: float = NON_PLANAR_WEIGHT
+    axial_weight: float = WEIGHT_ALONG_AXIS
     voxel_share: float = 1.0
     times_steps: int = 1
 
@@ -127,9 +127,9 @@ RESIDUALS = {
     ),
 }
 # Point to point in small voxels that pass for no planes, where all axes count alike; nothing that a user chooses.
-MEANS = replace(PLANE, is_wide=False, blob_weight=1.0, along=1.0)
+MEANS = replace(PLANE, is_wide=False, non_planar_weight=1.0, axial_weight=1.0)
 # Point to plane where planes alone are asked.
-PLANES_ALONE = replace(PLANE, blob_weight=0.0)
+PLANES_ALONE = replace(PLANE, non_planar_weight=0.0)
 
 
 def find_residual(name: str) -> ResidualKind:

@@ -53,7 +53,7 @@ SCANS = 100
 THIRDS = ("street", "corridor", "urban")
 
 
-BLOBS_AS_BEFORE = {**residuals.RESIDUALS, "plane": replace(residuals.RESIDUALS["plane"], along=1.0)}
+BLOBS_AS_BEFORE = {**residuals.RESIDUALS, "plane": replace(residuals.RESIDUALS["plane"], axial_weight=1.0)}
 WITHOUT_BLOBS = {**residuals.RESIDUALS, "plane": residuals.PLANES_ALONE}
 MAP: dict[str, Variant] = {
     "breadth": ((), ((local_map, "LEAST_BREADTH", 0.0),)),

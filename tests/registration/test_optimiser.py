@@ -169,7 +169,7 @@ def test_each_map_serves_what_the_finer_ones_left(residual: str) -> None:
     def found(count: int) -> RegistrationResult:
         return solve(
             levels[:count], scan, np.eye(4), Annealing(1.0, 40, decay=0.7), RegistrationConfig(),
-            residual=replace(find_residual(residual), blob_weight=0.0),
+            residual=replace(find_residual(residual), non_planar_weight=0.0),
         )  # fmt: skip
 
     one, two, three = (found(k) for k in (1, 2, 3))
@@ -181,7 +181,7 @@ def test_each_map_serves_what_the_finer_ones_left(residual: str) -> None:
 
 @pytest.mark.parametrize("residual", list(RESIDUALS))
 def test_no_point_is_matched_on_two_maps(residual: str) -> None:
-    """Bushes among walls: what a blob of the fine map serves, the coarse one does not serve again."""
+    """Bushes among walls: what a non-planar voxel of the fine map serves, the coarse one does not serve again."""
     rng = np.random.default_rng(0)
 
     def seen() -> NDArray[np.float32]:
@@ -203,7 +203,7 @@ def linearise_cauchy(points: tuple[Floats, Floats], voxels: Voxels, settings: Se
     """Point to plane with the weight of Cauchy, of planes alone."""
     source, _ = points
     planes, keys, table = voxels
-    cells, slots, chosen, asked, is_done, away2 = search
+    cells, slots, chosen, asked, is_done, distance2 = search
     R, t = pose
     H, _, g, facts = sums
     for i in range(len(source)):
@@ -222,7 +222,7 @@ def linearise_cauchy(points: tuple[Floats, Floats], voxels: Voxels, settings: Se
         w = robust / (p[6] + settings[1])
         j3, j4, j5 = r[1] * p[5] - r[2] * p[4], r[2] * p[3] - r[0] * p[5], r[0] * p[4] - r[1] * p[3]
         add_row(H, g, w, e, p[3], p[4], p[5], j3, j4, j5)
-        is_done[i], away2[i] = True, e * e
+        is_done[i], distance2[i] = True, e * e
         facts[at.INFORMATION] += w
         facts[at.SQUARED] += robust * e * e
         facts[at.INLIERS] += math.fabs(e) < width[0]

@@ -43,9 +43,13 @@ def as_source(points: NDArray[np.float32]) -> PreparedPoints:
     return PreparedPoints(points, points.astype(np.float64), np.zeros((len(points), 6)), len(points))
 
 
-def on(target: GaussianMap, points: NDArray[np.float32], prior: Floats, blob_weight: float = 0.5) -> RegistrationResult:
+def on(
+    target: GaussianMap, points: NDArray[np.float32], prior: Floats, non_planar_weight: float = 0.5
+) -> RegistrationResult:
     config = RegistrationConfig(sigma=NOISE, weak_share=1e-3)
-    return solve((target,), as_source(points), prior, FINE, config, residual=replace(PLANE, blob_weight=blob_weight))
+    return solve(
+        (target,), as_source(points), prior, FINE, config, residual=replace(PLANE, non_planar_weight=non_planar_weight)
+    )
 
 
 def map_of(world: Floats) -> GaussianMap:
@@ -188,7 +192,7 @@ def test_along_a_corridor_the_prior_stays(slide: float, turn: float) -> None:
     target = map_of(se3.apply(T_world_corridor, corridor(rng, 20000)))
     prior = T_world_corridor @ pose_at((slide, 0.1, 0.05), 0.5)
     scan = se3.apply(np.eye(4), corridor(rng, 600)).astype(np.float32)
-    result = on(target, scan, prior, blob_weight=0.0)
+    result = on(target, scan, prior, non_planar_weight=0.0)
     assert len(result.degenerate) == 1
     along = T_world_corridor[:3, 0]
     assert abs(result.degenerate[0, :3] @ along) > 0.99
@@ -205,7 +209,7 @@ def test_along_a_corridor_the_prior_stays(slide: float, turn: float) -> None:
 def test_on_one_plane_three_directions_keep_the_prior() -> None:
     rng = np.random.default_rng(6)
     prior = pose_at((0.2, -0.1, 0.1), 3.0)
-    result = on(map_of(floor_only(rng, 60000)), floor_only(rng, 1500).astype(np.float32), prior, blob_weight=0.0)
+    result = on(map_of(floor_only(rng, 60000)), floor_only(rng, 1500).astype(np.float32), prior, non_planar_weight=0.0)
     assert len(result.degenerate) == 3
     # z, roll and pitch are seen, whatever the basis of the rest.
     np.testing.assert_allclose(result.degenerate[:, 2:5], 0.0, atol=0.01)
@@ -230,7 +234,7 @@ def test_where_no_voxel_is_a_plane_the_fall_back_registers() -> None:
     assert (used < 0).all()
     T = random_pose(rng, 0.15, 0.8)
     scan = seen_from(balls(rng, 20), T)
-    with_it, without = (on(target, scan, np.eye(4), blob_weight=w) for w in (0.5, 0.0))
+    with_it, without = (on(target, scan, np.eye(4), non_planar_weight=w) for w in (0.5, 0.0))
     assert with_it.converged
     assert len(with_it.degenerate) == 0
     metres, degrees = distance(T, with_it.T_world_lidar)

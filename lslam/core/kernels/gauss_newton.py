@@ -173,8 +173,8 @@ def step_on_surfaces(
 
 
 @kernel
-def trimming_distance2(away2: Floats, share: float, gate2: float) -> float:
-    """Quantile `share` of the squared distances `away2` (S,), m2, of the matched points within `gate2`.
+def trimming_distance2(distance2: Floats, share: float, gate2: float) -> float:
+    """Quantile `share` of the squared distances `distance2` (S,), m2, of the matched points within `gate2`.
 
     Unmatched points have a negative distance. Bisection needs no copy and no sort, and is independent of the points' order.
     """
@@ -182,7 +182,7 @@ def trimming_distance2(away2: Floats, share: float, gate2: float) -> float:
         return gate2
     high = 0.0
     total = 0
-    for a in away2:
+    for a in distance2:
         if 0.0 <= a <= gate2:
             total += 1
             high = max(high, a)
@@ -190,7 +190,7 @@ def trimming_distance2(away2: Floats, share: float, gate2: float) -> float:
     for _ in range(40):
         middle = 0.5 * (low + high)
         count = 0
-        for a in away2:
+        for a in distance2:
             if 0.0 <= a <= middle:
                 count += 1
         if count >= share * total:

@@ -4,8 +4,8 @@
 
 points : source points (S, 3), LiDAR frame, m, and the attributes of each
 target : arrays of one map
-settings : constant numbers. For voxels: size, m; variance of a point, m2; weights of planes and of blobs; factor on the
-    blobs' weight along the sensor's axis; whether the map is the coarsest of several, which takes all remaining points.
+settings : constant numbers. For voxels: size, m; variance of a point, m2; weights of planes and of non-planar voxels;
+    factor on the latter along the sensor's axis; whether the map is the coarsest of several, which takes all remaining points.
 search : results kept from one iteration to the next, and from one map to the next coarser one, see `Search`
 pose : R (3, 3) and t (3,), m, world from LiDAR
 width : width of the robust kernel, m; its final width, m; squared distance, m2, beyond which correspondences are rejected
@@ -20,8 +20,9 @@ from __future__ import annotations
 from lslam.core.arrays import Bools, Floats, Ints, Longs
 
 Settings = tuple[float, float, float, float, float, bool]
-# Octant cell (S,) and slots (S, 8) of each point; its nearest plane and blob (S, 2), and the sphere within which these are the
-# nearest (S, 4), see `residuals.nearest`; whether it is matched (S,); its squared distance (S,), m2, -1 where it is not.
+# Octant cell (S,) and slots (S, 8) of each point; its nearest planar and non-planar voxel (S, 2), and the sphere within which
+# these are the nearest (S, 4), see `residuals.nearest`; whether it is matched (S,); its squared distance (S,), m2, -1 where it
+# is not.
 Search = tuple[Longs, Ints, Ints, Floats, Bools, Floats]
 Pose = tuple[Floats, Floats]
 Width = tuple[float, float, float]

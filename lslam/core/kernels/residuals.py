@@ -92,17 +92,19 @@ def nearest(
     last_slots : (S, 2) plane and non-planar voxel of the last search
     spheres : (S, 4) position of the point then, m, and the squared distance, m2, within which the result is valid
     """
-    best, blob = int(last_slots[i, 0]), int(last_slots[i, 1])
-    best_d, blob_d = 1e300, 1e300
+    best, non_planar = int(last_slots[i, 0]), int(last_slots[i, 1])
+    best_d, non_planar_d = 1e300, 1e300
     moved2 = (x - spheres[i, 0]) ** 2 + (y - spheres[i, 1]) ** 2 + (z - spheres[i, 2]) ** 2
     if moved2 < spheres[i, 3]:
         if best >= 0:
             best_d = (x - planes[best, 0]) ** 2 + (y - planes[best, 1]) ** 2 + (z - planes[best, 2]) ** 2
-        elif blob >= 0:
-            blob_d = (x - planes[blob, 0]) ** 2 + (y - planes[blob, 1]) ** 2 + (z - planes[blob, 2]) ** 2
-        return best, best_d, blob, blob_d
-    best, blob = -1, -1
-    next_d, next_blob_d = 1e300, 1e300
+        elif non_planar >= 0:
+            non_planar_d = (
+                (x - planes[non_planar, 0]) ** 2 + (y - planes[non_planar, 1]) ** 2 + (z - planes[non_planar, 2]) ** 2
+            )
+        return best, best_d, non_planar, non_planar_d
+    best, non_planar = -1, -1
+    next_d, next_non_planar_d = 1e300, 1e300
     # Choices instead of branches: nobody can predict which of the eight is the nearest.
     for k in range(8):
         s = slots[i, k]
@@ -114,14 +116,16 @@ def nearest(
         best = s if plane_d < best_d else best
         best_d = min(best_d, plane_d)
         far_d = d if kind == BLOB else 1e300
-        next_blob_d = min(next_blob_d, max(blob_d, far_d))
-        blob = s if far_d < blob_d else blob
-        blob_d = min(blob_d, far_d)
-    last_slots[i, 0], last_slots[i, 1] = best, blob
+        next_non_planar_d = min(next_non_planar_d, max(non_planar_d, far_d))
+        non_planar = s if far_d < non_planar_d else non_planar
+        non_planar_d = min(non_planar_d, far_d)
+    last_slots[i, 0], last_slots[i, 1] = best, non_planar
     spheres[i, 0], spheres[i, 1], spheres[i, 2] = x, y, z
-    margin = math.sqrt(next_d) - math.sqrt(best_d) if best >= 0 else math.sqrt(next_blob_d) - math.sqrt(blob_d)
-    spheres[i, 3] = 0.25 * margin * margin if best >= 0 or blob >= 0 else 1e300
-    return best, best_d, blob, blob_d
+    margin = (
+        math.sqrt(next_d) - math.sqrt(best_d) if best >= 0 else math.sqrt(next_non_planar_d) - math.sqrt(non_planar_d)
+    )
+    spheres[i, 3] = 0.25 * margin * margin if best >= 0 or non_planar >= 0 else 1e300
+    return best, best_d, non_planar, non_planar_d
 
 
 @inline
@@ -153,15 +157,15 @@ def linearise(
 
     Each point takes the nearest plane voxel of the eight around it: residual n . (R s + t - mean), variance = map
     eigenvalue + source scatter along the normal + sigma2 + tilt at that distance from the mean, Geman-McClure weight of
-    width `scale`, times `plane_weight`. Without a plane the residual is point to point to the nearest blob, with its mean
-    variance, times `blob_weight`, and times `along` in the direction of the sensor's axis.
-    `away2` (S,), m2, takes the squared distance of each matched point to its plane or mean. Points beyond `gate2` are
+    width `scale`, times `plane_weight`. Without a plane the residual is point to point to the nearest non-planar voxel, with
+    its mean variance, times `non_planar_weight`, and times `axial_weight` in the direction of the sensor's axis.
+    `distance2` (S,), m2, takes the squared distance of each matched point to its plane or mean. Points beyond `gate2` are
     rejected: they count as matched and have no weight.
     """
     source, scatter = points
     planes, keys, table = voxels
-    size, sigma2, plane_weight, blob_weight, along, _ = settings
-    cells, slots, chosen, asked, is_done, away2 = search
+    size, sigma2, plane_weight, non_planar_weight, axial_weight, _ = settings
+    cells, slots, chosen, asked, is_done, distance2 = search
     R, t = pose
     scale, _, gate2 = width
     H, _, g, facts = sums
@@ -173,13 +177,13 @@ def linearise(
         rx, ry, rz, x, y, z = place(source, i, R, t)
         if octant_slots(x, y, z, i, inverse, cells, slots, keys, table):
             asked[i, 3] = -1.0
-        best, best_d, blob, blob_d = nearest(x, y, z, i, slots, chosen, asked, planes)
+        best, best_d, non_planar, non_planar_d = nearest(x, y, z, i, slots, chosen, asked, planes)
         if best >= 0:
             is_done[i] = True
             p = planes[best]
             nx, ny, nz = p[3], p[4], p[5]
             r = nx * (x - p[0]) + ny * (y - p[1]) + nz * (z - p[2])
-            away2[i] = r * r
+            distance2[i] = r * r
             facts[MATCHED] += 1.0
             if abs(r) < scale:
                 facts[INLIERS] += 1.0
@@ -202,14 +206,14 @@ def linearise(
             j3, j4, j5 = ry * nz - rz * ny, rz * nx - rx * nz, rx * ny - ry * nx
             add_row(H, g, w, r, nx, ny, nz, j3, j4, j5)
             add_facts(facts, w, robust * r * r, robust, rx, ry, rz)
-        elif blob >= 0 and blob_weight > 0.0:
+        elif non_planar >= 0 and non_planar_weight > 0.0:
             is_done[i] = True
-            p = planes[blob]
+            p = planes[non_planar]
             ux, uy, uz = R[0, 2], R[1, 2], R[2, 2]
             ex, ey, ez = x - p[0], y - p[1], z - p[2]
-            drop = 1.0 - along
-            across2 = blob_d - drop * (ux * ex + uy * ey + uz * ez) ** 2
-            away2[i] = across2
+            drop = 1.0 - axial_weight
+            across2 = non_planar_d - drop * (ux * ex + uy * ey + uz * ez) ** 2
+            distance2[i] = across2
             facts[MATCHED] += 1.0
             if across2 < c2:
                 facts[INLIERS] += 1.0
@@ -218,7 +222,7 @@ def linearise(
             robust = c2 / (c2 + across2)
             robust *= robust
             q = scatter[i]
-            w = blob_weight * robust / (p[6] + (q[0] + q[3] + q[5]) / 3.0 + sigma2)
+            w = non_planar_weight * robust / (p[6] + (q[0] + q[3] + q[5]) / 3.0 + sigma2)
             add_information(
                 H,
                 g,
@@ -236,8 +240,8 @@ def linearise(
                 ry,
                 rz,
             )
-            facts[INFORMATION] += (2.0 + along) * w
-            facts[LEVER] += (2.0 + along) * w * (rx * rx + ry * ry + rz * rz)
+            facts[INFORMATION] += (2.0 + axial_weight) * w
+            facts[LEVER] += (2.0 + axial_weight) * w * (rx * rx + ry * ry + rz * rz)
 
 
 @inline

@@ -169,9 +169,9 @@ class PairRegistration:
 
     def _lay(self, start: Floats, annealing: Annealing) -> MotionHypothesis:
         motion = optimise(Problem(self._terms, start, annealing, Limits(SETTINGS.weak_share), self._matches))
-        away2 = self._matches.away2
+        distance2 = self._matches.distance2
         cells = directions(se3.apply(motion.T_world_lidar, self._source))
-        on_planes = (away2 >= 0) & (away2 < KERNEL_MIN_M**2)
+        on_planes = (distance2 >= 0) & (distance2 < KERNEL_MIN_M**2)
         return MotionHypothesis(motion, on_planes, int(np.isin(cells, self._view).sum()))
 
 

@@ -137,13 +137,13 @@ def linearise_lines(
     Each takes the line voxel, of the eight around it, whose mean is nearest: residual across its line, variance =
     that of the voxel across its line + sigma2 + tilt at that distance along it, Geman-McClure weight of width `scale`.
     settings : voxel size, m; variance of a point, m2; points and floor of a line's variance, m2, see `line_of`
-    search : octant cells and slots; `away2` (S,) takes the squared distance of each matched point to its line: those beyond
+    search : octant cells and slots; `distance2` (S,) takes the squared distance of each matched point to its line: those beyond
     `gate2` are rejected: they count as matched and have no weight
     """
     (source,) = points
     moments, keys, table, lines, line_keys, line_sums = voxels
     size, sigma2, min_points, floor = settings
-    cells, slots, away2 = search
+    cells, slots, distance2 = search
     R, t = pose
     scale, _, gate2 = width
     H, _, g, facts = sums
@@ -171,8 +171,8 @@ def linearise_lines(
         p = lines[best]
         ex, ey, ez = x - p[0], y - p[1], z - p[2]
         along = ex * p[3] + ey * p[4] + ez * p[5]
-        away2[i] = max(ex * ex + ey * ey + ez * ez - along * along, 0.0)
-        if away2[i] > gate2:
+        distance2[i] = max(ex * ex + ey * ey + ez * ez - along * along, 0.0)
+        if distance2[i] > gate2:
             facts[MATCHED] += 1.0
             continue
         variance = p[6] + sigma2 + TILT_FACTOR * p[7] * along * along

@@ -85,13 +85,14 @@ def linearise_gicp(
     e = R s + t - mean of the nearest plane voxel of eight, and M = inv(C_t + R C_s R^T) with the voxel's disc C_t. The disc's
     variance along the normal is that of the voxel's points and tilt (Segal et al. take a constant, for planes of twenty
     neighbours). The cost is robust(thin e^T M e) / thin, where `thin`, m2, the variance of a pair along a common normal, scales
-    the squared Mahalanobis distance to m2. Without a plane the nearest blob is used, isotropic with its mean variance, times
-    `blob_weight`. M is constant within a Gauss-Newton step. S is the information along the normals alone, with blobs.
+    the squared Mahalanobis distance to m2. Without a plane the nearest non-planar voxel is used, isotropic with its mean
+    variance, times `non_planar_weight`. M is constant within a Gauss-Newton step. S is the information along the normals alone,
+    and of non-planar voxels.
     """
     source, covariance = points
     planes, keys, table = voxels
-    size, sigma2, plane_weight, blob_weight, _, _ = settings
-    cells, slots, chosen, asked, is_done, away2 = search
+    size, sigma2, plane_weight, non_planar_weight, _, _ = settings
+    cells, slots, chosen, asked, is_done, distance2 = search
     R, t = pose
     scale, _, gate2 = width
     H, S, g, facts = sums
@@ -106,18 +107,18 @@ def linearise_gicp(
         rx, ry, rz, x, y, z = place(source, i, R, t)
         if octant_slots(x, y, z, i, inverse, cells, slots, keys, table):
             asked[i, 3] = -1.0
-        best, _, blob, _ = nearest(x, y, z, i, slots, chosen, asked, planes)
+        best, _, non_planar, _ = nearest(x, y, z, i, slots, chosen, asked, planes)
         if best < 0:
-            if blob < 0 or blob_weight <= 0.0:
+            if non_planar < 0 or non_planar_weight <= 0.0:
                 continue
-            best = blob
+            best = non_planar
         is_done[i] = True
         p = planes[best]
         is_plane = p[7] >= 0.0
         ex, ey, ez = x - p[0], y - p[1], z - p[2]
         scatter = rotate_symmetric(R, covariance[i])
         mxx, mxy, mxz, myy, myz, mzz, away = certainty_of_pair(p, is_plane, ex, ey, ez, scatter, sigma2, extent2)
-        away2[i] = away
+        distance2[i] = away
         facts[MATCHED] += 1.0
         if away < c2:
             facts[INLIERS] += 1.0
@@ -125,7 +126,7 @@ def linearise_gicp(
             continue
         robust = c2 / (c2 + away)
         robust *= robust
-        w = robust * (plane_weight if is_plane else blob_weight)
+        w = robust * (plane_weight if is_plane else non_planar_weight)
         add_information(H, g, w, mxx, mxy, mxz, myy, myz, mzz, ex, ey, ez, rx, ry, rz)
         trace = w * (mxx + myy + mzz)
         if is_plane:
@@ -153,8 +154,8 @@ def linearise_vgicp(
     """
     source, covariance = points
     planes, counts, keys, table = voxels
-    size, sigma2, plane_weight, blob_weight, _, _ = settings
-    cells, slots, chosen, asked, is_done, away2 = search
+    size, sigma2, plane_weight, non_planar_weight, _, _ = settings
+    cells, slots, chosen, asked, is_done, distance2 = search
     R, t = pose
     scale, _, gate2 = width
     H, S, g, facts = sums
@@ -168,15 +169,15 @@ def linearise_vgicp(
         rx, ry, rz, x, y, z = place(source, i, R, t)
         if octant_slots(x, y, z, i, inverse, cells, slots, keys, table):
             asked[i, 3] = -1.0
-            # Planes, or blobs where there are none.
+            # Planes, or non-planar voxels where there are none.
             least = EMPTY
             for k in range(8):
                 if slots[i, k] >= 0 and planes[slots[i, k], 7] >= 0.0:
                     least = BLOB
             keep(i, slots, planes, 7, least)
         scatter = rotate_symmetric(R, covariance[i])
-        best, _, blob, _ = nearest(x, y, z, i, slots, chosen, asked, planes)
-        if best < 0 and (blob < 0 or blob_weight <= 0.0):
+        best, _, non_planar, _ = nearest(x, y, z, i, slots, chosen, asked, planes)
+        if best < 0 and (non_planar < 0 or non_planar_weight <= 0.0):
             continue
         is_done[i] = True
         closest, closest_robust = 1e300, 0.0
@@ -187,11 +188,11 @@ def linearise_vgicp(
             v = slots[i, k]
             if v < 0:
                 break
-            if best < 0 and v != blob:
+            if best < 0 and v != non_planar:
                 continue
             p = planes[v]
             ex, ey, ez = x - p[0], y - p[1], z - p[2]
-            n = (plane_weight if best >= 0 else blob_weight) * counts[v]
+            n = (plane_weight if best >= 0 else non_planar_weight) * counts[v]
             mxx, mxy, mxz, myy, myz, mzz, away = certainty_of_pair(p, best >= 0, ex, ey, ez, scatter, sigma2, extent2)
             robust = c2 / (c2 + away)
             robust *= robust
@@ -216,7 +217,7 @@ def linearise_vgicp(
         add_gradient(g, gx, gy, gz, rx, ry, rz)
         facts[INFORMATION] += hxx + hyy + hzz
         facts[LEVER] += (hxx + hyy + hzz) * (rx * rx + ry * ry + rz * rz)
-        away2[i] = closest
+        distance2[i] = closest
         facts[MATCHED] += 1.0
         if closest < c2:
             facts[INLIERS] += 1.0

@@ -101,14 +101,14 @@ def linearise_ndt(
     `widening` is 1 except during annealing, when it widens the Gaussians as the kernel is widened. g is the gradient. H is
     the Gauss-Newton Hessian, J^T C^-1 J times the weight d1 d2 exp(..) of the gradient. Newton's Hessian, which Magnusson
     uses, also has the curvature of that weight and of the rotation; it is indefinite away from the optimum and then needs
-    correction. The score is robust by itself: the variance of a point and the weight of blobs do not enter. Distances are
-    e^T C^-1 e times the smallest eigenvalue of C, for the nearest voxel. S is the information along the thinnest axis of
+    correction. The score is robust by itself: the variance of a point and the weight of non-planar voxels do not enter. Distances
+    are e^T C^-1 e times the smallest eigenvalue of C, for the nearest voxel. S is the information along the thinnest axis of
     each voxel alone.
     """
     (source,) = points
     shapes, keys, table = voxels
     size, _, _, _, _, _ = settings
-    cells, slots, _, _, is_done, away2 = search
+    cells, slots, _, _, is_done, distance2 = search
     R, t = pose
     scale, scale_end, gate2 = width
     widening = (scale / scale_end) ** 2
@@ -161,7 +161,7 @@ def linearise_ndt(
             facts[INFORMATION] += hxx + hyy + hzz
             facts[LEVER] += (hxx + hyy + hzz) * (rx * rx + ry * ry + rz * rz)
             is_done[i] = True
-            away2[i] = best
+            distance2[i] = best
             facts[MATCHED] += 1.0
             facts[SQUARED] += best_score * best
             facts[ROBUST] += best_score

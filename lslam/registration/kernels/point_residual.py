@@ -30,7 +30,7 @@ def linearise_point(
     source, gaps = points
     planes, keys, table = voxels
     size, sigma2, _, _, _, takes_all = settings
-    cells, slots, _, _, is_done, away2 = search
+    cells, slots, _, _, is_done, distance2 = search
     R, t = pose
     scale, _, gate2 = width
     H, _, g, facts = sums
@@ -55,7 +55,7 @@ def linearise_point(
         if best < 0 or (gaps[i] > size and planes[best, 7] < BLOB and not takes_all):
             continue
         is_done[i] = True
-        away2[i] = best_d
+        distance2[i] = best_d
         facts[MATCHED] += 1.0
         if best_d < c2:
             facts[INLIERS] += 1.0

@@ -103,7 +103,7 @@ def point_pairs(target: VoxelMap, source: Floats, R: Floats, t: Floats, sigma2: 
 
 
 def disc_pairs(
-    target: VoxelMap, source: Floats, covariance: Floats, R: Floats, t: Floats, sigma2: float, blob_weight: float,
+    target: VoxelMap, source: Floats, covariance: Floats, R: Floats, t: Floats, sigma2: float, non_planar_weight: float,
     only_nearest: bool,
 ) -> list[Pair]:  # fmt: skip
     """G-ICP's pairs, or with all planes around VGICP's, whose weight is the voxel's count."""
@@ -113,9 +113,9 @@ def disc_pairs(
         near = [(*kind_of(v, MIN_POINTS, PLANARITY), v.count) for v in around(target, world)]
         near.sort(key=lambda k: float(np.sum((world - k[1]) ** 2)))
         planes = [k for k in near if k[0] == "plane"]
-        blobs = [k for k in near if k[0] == "blob"][: 1 if blob_weight > 0 else 0]
+        blobs = [k for k in near if k[0] == "blob"][: 1 if non_planar_weight > 0 else 0]
         for kind, mean, normal, variance, slope, count in (planes[:1] if only_nearest else planes) or blobs:
-            share = 1.0 if kind == "plane" else blob_weight
+            share = 1.0 if kind == "plane" else non_planar_weight
             if kind == "plane":
                 e = world - mean
                 beside2 = float(e @ e - (normal @ e) ** 2)

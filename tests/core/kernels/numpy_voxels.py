@@ -135,10 +135,10 @@ def kind_of(voxel: Voxel, min_points: int, planarity: float) -> tuple[str, Float
 
 
 def matches(
-    target: VoxelMap, source: Floats, scatter: Floats, R: Floats, t: Floats, sigma2: float, blob_weight: float,
+    target: VoxelMap, source: Floats, scatter: Floats, R: Floats, t: Floats, sigma2: float, non_planar_weight: float,
     tilt: float, along: float, min_points: int = 6, planarity: float = 0.3,
 ) -> list[Match]:  # fmt: skip
-    """The nearest plane of the eight voxels around each point, else the nearest blob."""
+    """The nearest plane of the eight voxels around each point, else the nearest non-planar voxel."""
     kinds = {cell: kind_of(v, min_points, planarity) for cell, v in target.voxels.items()}
     out = []
     for point, six in zip(source, scatter, strict=True):
@@ -147,14 +147,14 @@ def matches(
         around = [tuple(np.add(corner, (i, j, k)).tolist()) for i in (0, 1) for j in (0, 1) for k in (0, 1)]
         near = [kinds[cell] for cell in around if cell in kinds and kinds[cell][0] != "empty"]
         planes = [k for k in near if k[0] == "plane"]
-        chosen = planes or (near if blob_weight > 0 else [])
+        chosen = planes or (near if non_planar_weight > 0 else [])
         if not chosen:
             continue
         kind, mean, normal, variance, slope = min(chosen, key=lambda k: float(np.sum((world - k[1]) ** 2)))
         C = symmetric(six)
         if kind == "blob":
             spread = float(np.trace(C)) / 3
-            out.append(Match(point, mean, None, variance + spread + sigma2, blob_weight, sensor_axes(R, along)))
+            out.append(Match(point, mean, None, variance + spread + sigma2, non_planar_weight, sensor_axes(R, along)))
             continue
         e = world - mean
         beside2 = float(e @ e - (normal @ e) ** 2)

@@ -161,9 +161,9 @@ def test_a_long_step_is_cut_and_one_that_is_no_number_not_made() -> None:
 @pytest.mark.parametrize("bound", [np.inf, 0.3])
 def test_trimming_keeps_the_share_of_the_nearest(share: float, bound: float) -> None:
     rng = np.random.default_rng(4)
-    away2 = np.where(rng.uniform(size=2000) < 0.2, -1.0, rng.exponential(0.2, 2000))
-    limit = gauss_newton.trimming_distance2(away2, share, bound)
-    candidates = away2[(away2 >= 0) & (away2 <= bound)]
+    distance2 = np.where(rng.uniform(size=2000) < 0.2, -1.0, rng.exponential(0.2, 2000))
+    limit = gauss_newton.trimming_distance2(distance2, share, bound)
+    candidates = distance2[(distance2 >= 0) & (distance2 <= bound)]
     assert np.mean(candidates <= limit) == pytest.approx(share, abs=1.5 / len(candidates))
-    assert gauss_newton.trimming_distance2(away2[::-1].copy(), share, bound) == limit
-    assert gauss_newton.trimming_distance2(away2, 1.0, bound) == bound
+    assert gauss_newton.trimming_distance2(distance2[::-1].copy(), share, bound) == limit
+    assert gauss_newton.trimming_distance2(distance2, 1.0, bound) == bound

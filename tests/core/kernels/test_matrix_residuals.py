@@ -43,7 +43,7 @@ class Sums:
     H: Floats
     g: Floats
     facts: Floats
-    away2: Floats
+    distance2: Floats
     S: Floats
 
 
@@ -98,10 +98,11 @@ def linearise(
         s.source.astype(np.float32), s.source, np.zeros((n, 6)), n, covariance=s.covariance, gaps=np.full(n, gap)
     )
     kind.linearise(
-        kind.points(seen, np.sqrt(SIGMA2)), kind.voxels(s.target), (s.target.size, SIGMA2, 1.0, blob, kind.along, takes_all),
+        kind.points(seen, np.sqrt(SIGMA2)), kind.voxels(s.target),
+        (s.target.size, SIGMA2, 1.0, blob, kind.axial_weight, takes_all),
         matches.search(s.target), (s.R, s.t), (c, 0.15, gate2), (H, S, g, facts),
     )  # fmt: skip
-    return Sums(np.triu(H) + np.triu(H, 1).T, g, facts, matches.away2, np.triu(S) + np.triu(S, 1).T)
+    return Sums(np.triu(H) + np.triu(H, 1).T, g, facts, matches.distance2, np.triu(S) + np.triu(S, 1).T)
 
 
 def reference(s: Scene, residual: str, c: float, blob: float = BLOB) -> tuple[list[Pair], GemanMcClure | Magnusson]:
@@ -175,13 +176,13 @@ def test_distances_and_counts_are_those_of_the_closest_pair(scene: Scene, residu
     found = linearise(scene, residual, c)
     is_matched = np.isfinite(expected)
     assert 0 < is_matched.sum() < len(expected)
-    np.testing.assert_allclose(found.away2[is_matched], expected[is_matched], rtol=1e-6, atol=1e-12)
-    np.testing.assert_array_equal(found.away2[~is_matched], -1.0)
+    np.testing.assert_allclose(found.distance2[is_matched], expected[is_matched], rtol=1e-6, atol=1e-12)
+    np.testing.assert_array_equal(found.distance2[~is_matched], -1.0)
     assert found.facts[at.MATCHED] == is_matched.sum()
     width2 = c**2 + SIZE**2 if residual == "point" else c**2
     assert found.facts[at.INLIERS] == (expected < width2).sum() > 0
     gated = linearise(scene, residual, c, 0.01)
-    np.testing.assert_array_equal(gated.away2, found.away2)
+    np.testing.assert_array_equal(gated.distance2, found.distance2)
     np.testing.assert_array_equal(gated.facts[[at.INLIERS, at.MATCHED]], found.facts[[at.INLIERS, at.MATCHED]])
 
 
@@ -196,7 +197,7 @@ def test_means_of_few_points_between_distant_rings_are_not_matched(scene: Scene)
     assert linearise(few, "point", 1.0, gap=0.9 * SIZE).facts[at.MATCHED] == 2
     left = linearise(few, "point", 1.0, gap=1.1 * SIZE)
     assert left.facts[at.MATCHED] == 1
-    assert left.away2[0] == -1.0 < left.away2[1]
+    assert left.distance2[0] == -1.0 < left.distance2[1]
     assert linearise(few, "point", 1.0, gap=1.1 * SIZE, takes_all=True).facts[at.MATCHED] == 2
 
 
@@ -224,7 +225,7 @@ def test_a_search_goes_on_as_a_new_one_would(scene: Scene, residual: str) -> Non
         scene = replace(scene, t=scene.t + rng.normal(0, step, 3))
         matches.clear()
         went_on, new = (linearise(scene, residual, 0.4, matches=m) for m in (matches, None))
-        for name in ("H", "g", "facts", "away2", "S"):
+        for name in ("H", "g", "facts", "distance2", "S"):
             np.testing.assert_array_equal(getattr(went_on, name), getattr(new, name))
 
 

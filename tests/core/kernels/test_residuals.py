@@ -32,10 +32,10 @@ class Scene:
     R: Floats
     t: Floats
 
-    def matches(self, blob_weight: float = BLOB, along: float = ALONG) -> list[Match]:
+    def matches(self, non_planar_weight: float = BLOB, along: float = ALONG) -> list[Match]:
         p = self.points
         return matches(
-            self.reference, p.source, p.scatter, self.R, self.t, SIGMA2, blob_weight, TILT, along
+            self.reference, p.source, p.scatter, self.R, self.t, SIGMA2, non_planar_weight, TILT, along
         )  # fmt: skip
 
 
