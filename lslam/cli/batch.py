@@ -18,9 +18,9 @@ from lslam.studies.options import BATCH, require_free
 
 if TYPE_CHECKING:
     from lslam.core.types.study import StudyRow
+    from lslam.studies.batch_runs import RunLine
     from lslam.studies.jobs import ExpandedStudy
     from lslam.studies.options import OutputOptions
-    from lslam.studies.study_runs import RunLine
 
 # Options of `lslam run` that belong to the whole batch.
 _OF_THE_BATCH = ("resume", "overwrite", "dry_run", "as_json")
@@ -72,10 +72,10 @@ def _expand(path: Path, output: OutputOptions, given: dict[str, Any]) -> Expande
 
         check_settings(given["settings"])
         batch = read_batch(path)
-        from lslam.studies.study_runs import expand_batch
+        from lslam.studies.batch_runs import expand_batch
 
         return expand_batch(batch, output, given["settings"])
-    from lslam.studies.study_runs import expand_lines, run_words
+    from lslam.studies.batch_runs import expand_lines, run_words
 
     lines = [_line(number, words, given) for number, words in run_words(sys.stdin.read())]
     if not lines:
@@ -89,7 +89,7 @@ def _line(number: int, words: list[str], given: dict[str, Any]) -> RunLine:
     from lslam.cli.run import command as run_command
     from lslam.cli.run import open_with, resolve
     from lslam.io.readers import find_folder
-    from lslam.studies.study_runs import listed_line, opened_line, refused_line
+    from lslam.studies.batch_runs import listed_line, opened_line, refused_line
 
     try:
         run = run_command.make_context("run", list(words)).params

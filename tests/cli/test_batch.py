@@ -16,9 +16,9 @@ from calling import COMMAND, Done, assert_one_sentence, environment, lslam, samp
 from lslam.cli.batch import _line, command
 from lslam.core.config.study import BatchConfig, read_batch
 from lslam.core.errors import ConfigError, LslamError, OutputExistsError
+from lslam.studies.batch_runs import expand_batch, run_words
 from lslam.studies.options import OutputOptions
 from lslam.studies.results_csv import read_study_csv
-from lslam.studies.study_runs import expand_batch, run_words
 
 pytestmark = pytest.mark.usefixtures("forked_runs")
 

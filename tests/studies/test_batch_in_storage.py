@@ -14,11 +14,11 @@ from lslam.core.config.study import BatchConfig, parse_batch
 from lslam.core.types.study import StudyRow
 from lslam.io.remote import RemotePath
 from lslam.pipeline.run_folder import spool_of
+from lslam.studies.batch_runs import expand_batch, expand_lines, listed_line
 from lslam.studies.cluster import connect
 from lslam.studies.jobs import folders_of_finished, make_runs, output_file
 from lslam.studies.options import OutputOptions
 from lslam.studies.results_csv import read_state, read_study_csv
-from lslam.studies.study_runs import expand_batch, expand_lines, listed_line
 
 
 @pytest.fixture

@@ -1,11 +1,19 @@
-"""What a person says of a run on its page: pairs of scans and control points, in two files that `lslam graph` reads."""
+"""What a person says of a run on its page: pairs of scans and control points, in two files that `lslam graph` reads.
+
+And the process of `lslam graph` that makes a new run of them.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
+import subprocess
+import sys
 import threading
+from collections import deque
 from collections.abc import Mapping, Sequence
+from contextvars import copy_context
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -17,7 +25,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 from lslam.backend.keyframes.store import KeyframeStore, mounted_up
 from lslam.backend.loops.find_loops import verify_pairs, view_pair
 from lslam.backend.manual import keyframe_pairs, read_control_points, read_named_pairs, stamp_of
-from lslam.core.errors import InputError, UsageError
+from lslam.core.errors import InputError, OutputError, OutputExistsError, UsageError, cause
 from lslam.core.geometry.crs_names import crs_name, parse_crs
 from lslam.core.types.constraint import Instant, NamedPair
 from lslam.core.types.scan_result import ScanResult
@@ -29,6 +37,8 @@ from lslam.reports.page_data import judgement, pair_data
 
 EDITS, POINTS = "edits.csv", "points.csv"
 MOST_POINTS = 12_000  # points of a scan's surroundings on the page, at most
+MOST_LINES = 30  # lines of the child that are kept
+PATIENCE_S = 20.0  # for a child that was asked to stop
 
 
 class Pair(BaseModel):
@@ -196,3 +206,69 @@ def _write(path: Path, kind: type[BaseModel], rows: Sequence[BaseModel]) -> None
     table.writeheader()
     table.writerows(row.model_dump() for row in rows)
     write_text(path, text.getvalue())
+
+
+class GraphJob:
+    """Child process of `lslam graph`, with the arguments `words` after the run; `out` is its new folder."""
+
+    def __init__(self, run: Path, words: list[str]) -> None:
+        """Start the process. Raises OutputError when that fails."""
+        self.out = next_folder(run)
+        command = [sys.executable, "-m", "lslam", "graph", str(run), *words, "--out", str(self.out)]
+        self._is_asked = False
+        self._said: deque[str] = deque(maxlen=MOST_LINES)
+        try:
+            self._child = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.PIPE,
+                text=True,
+                errors="replace",
+                start_new_session=True,  # what the terminal sends comes from the server alone
+            )
+        except OSError as error:
+            raise OutputError(f"lslam graph cannot be started: {cause(error)}") from None
+        self._reader = threading.Thread(target=copy_context().run, args=(self._read,), name="lslam-graph", daemon=True)
+        self._reader.start()
+
+    @property
+    def is_running(self) -> bool:
+        """Whether it is not over."""
+        return self._child.poll() is None
+
+    def state(self) -> dict[str, Any]:
+        """State of the child (`running`, `done`, `stopped` or `failed`), its folder, and its last lines of output."""
+        code = self._child.poll()
+        if code is not None:
+            self._reader.join(PATIENCE_S)
+        # Asked before it heeds signals, it dies of one.
+        word = "running" if code is None else "done" if code == 0 else "stopped" if self._is_asked else "failed"
+        return {"state": word, "out": self.out.name, "said": list(self._said)}
+
+    def stop(self) -> None:
+        """Terminate the child (SIGTERM), and kill it if it does not end in time."""
+        if self.is_running:
+            self._is_asked = True
+            self._child.terminate()
+            try:
+                self._child.wait(PATIENCE_S)
+            except subprocess.TimeoutExpired:
+                self._child.kill()
+                self._child.wait()
+
+    def _read(self) -> None:
+        assert self._child.stderr is not None
+        with contextlib.suppress(ValueError):
+            for line in self._child.stderr:
+                self._said.append(line.rstrip().removeprefix("INFO: "))
+
+
+def next_folder(run: Path) -> Path:
+    """RUN-graph beside the run, or the first of RUN-graph-2, ... that is free. Raises OutputExistsError when none is free."""
+    named = run.resolve()
+    for number in range(1, 1000):
+        folder = named.with_name(f"{named.name}-graph" + (f"-{number}" if number > 1 else ""))
+        if not folder.exists():
+            return folder
+    raise OutputExistsError(f"{named}-graph to {named}-graph-999 exist: remove some of them")

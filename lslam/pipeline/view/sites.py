@@ -1,17 +1,13 @@
-"""`lslam view`: a run on its server, and those that its corrections lead to; its page, its map in tiles, `lslam graph`."""
+"""`lslam view`: a run on its server, and those that its corrections lead to; its page, and its map in tiles."""
 
 from __future__ import annotations
 
-import contextlib
 import json
 import logging
 import os
 import shutil
-import subprocess
-import sys
 import tempfile
 import threading
-from collections import deque
 from collections.abc import Sequence
 from contextvars import copy_context
 from functools import cached_property, partial
@@ -27,9 +23,7 @@ from lslam.core.errors import (
     InterruptedRunError,
     LslamError,
     OutputError,
-    OutputExistsError,
     UsageError,
-    cause,
     input_errors,
 )
 from lslam.core.geometry import se3
@@ -45,7 +39,7 @@ from lslam.pipeline.rebuild import read_run
 from lslam.pipeline.resume import listing_digest
 from lslam.pipeline.run_folder import SESSIONS, require_odometry
 from lslam.pipeline.stored_map import map_of
-from lslam.pipeline.view.corrections import Corrections
+from lslam.pipeline.view.corrections import Corrections, GraphJob
 from lslam.pipeline.view.server import Answer, RunServer, Site
 from lslam.reports.page_data import pack
 from lslam.reports.png import usual_range
@@ -56,8 +50,6 @@ REPORT, TRAJECTORY = "report.html", "trajectory.tum"
 TALKS = "connect-src 'self'"
 SERVED = '<script type="application/json" id="served">{}</script>\n'  # tells the page's script
 MERGE_REFUSAL = "is a merge, whose loops cannot be corrected: correct its runs with lslam view, and merge them again"
-MOST_LINES = 30  # lines of the child that are kept
-PATIENCE_S = 20.0  # for a child that was asked to stop
 # Of the nodes and of their index; raise VERSION when either means something else. Octrees that are kept, the last used ones.
 NODES, TREE, VERSION, MOST_OCTREES = "nodes.bin", "tree.json", 1, 8
 SAMPLE = 400_000  # points whose intensities give the range that is shown
@@ -199,72 +191,6 @@ def _refuse(folder: Path, document: Any) -> None:
 
 def _page(text: str, rules: str) -> Answer:
     return Answer("text/html; charset=utf-8", text.encode(), headers=(("Content-Security-Policy", rules),))
-
-
-class GraphJob:
-    """Child process of `lslam graph`, with the arguments `words` after the run; `out` is its new folder."""
-
-    def __init__(self, run: Path, words: list[str]) -> None:
-        """Start the process. Raises OutputError when that fails."""
-        self.out = next_folder(run)
-        command = [sys.executable, "-m", "lslam", "graph", str(run), *words, "--out", str(self.out)]
-        self._is_asked = False
-        self._said: deque[str] = deque(maxlen=MOST_LINES)
-        try:
-            self._child = subprocess.Popen(
-                command,
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.PIPE,
-                text=True,
-                errors="replace",
-                start_new_session=True,  # what the terminal sends comes from the server alone
-            )
-        except OSError as error:
-            raise OutputError(f"lslam graph cannot be started: {cause(error)}") from None
-        self._reader = threading.Thread(target=copy_context().run, args=(self._read,), name="lslam-graph", daemon=True)
-        self._reader.start()
-
-    @property
-    def is_running(self) -> bool:
-        """Whether it is not over."""
-        return self._child.poll() is None
-
-    def state(self) -> dict[str, Any]:
-        """State of the child (`running`, `done`, `stopped` or `failed`), its folder, and its last lines of output."""
-        code = self._child.poll()
-        if code is not None:
-            self._reader.join(PATIENCE_S)
-        # Asked before it heeds signals, it dies of one.
-        word = "running" if code is None else "done" if code == 0 else "stopped" if self._is_asked else "failed"
-        return {"state": word, "out": self.out.name, "said": list(self._said)}
-
-    def stop(self) -> None:
-        """Terminate the child (SIGTERM), and kill it if it does not end in time."""
-        if self.is_running:
-            self._is_asked = True
-            self._child.terminate()
-            try:
-                self._child.wait(PATIENCE_S)
-            except subprocess.TimeoutExpired:
-                self._child.kill()
-                self._child.wait()
-
-    def _read(self) -> None:
-        assert self._child.stderr is not None
-        with contextlib.suppress(ValueError):
-            for line in self._child.stderr:
-                self._said.append(line.rstrip().removeprefix("INFO: "))
-
-
-def next_folder(run: Path) -> Path:
-    """RUN-graph beside the run, or the first of RUN-graph-2, ... that is free. Raises OutputExistsError when none is free."""
-    named = run.resolve()
-    for number in range(1, 1000):
-        folder = named.with_name(f"{named.name}-graph" + (f"-{number}" if number > 1 else ""))
-        if not folder.exists():
-            return folder
-    raise OutputExistsError(f"{named}-graph to {named}-graph-999 exist: remove some of them")
 
 
 class MapTiles:
