@@ -53,6 +53,16 @@ def add_facts(facts: Floats, information: float, square: float, robust: float, r
 
 
 @inline
+def weigh_match(facts: Floats, d2: float, c2: float, gate2: float) -> float:
+    """Count a match at a squared distance, m2; its Geman-McClure weight of squared width `c2`, 0 beyond `gate2`."""
+    facts[MATCHED] += 1.0
+    if d2 < c2:
+        facts[INLIERS] += 1.0
+    root = c2 / (c2 + d2)
+    return root * root if d2 <= gate2 else 0.0
+
+
+@inline
 def octant_slots(
     x: float, y: float, z: float, i: int, inverse: float, cells: Longs, slots: Ints, keys: Longs, table: Ints
 ) -> bool:
@@ -184,10 +194,8 @@ def linearise(
             nx, ny, nz = p[3], p[4], p[5]
             r = nx * (x - p[0]) + ny * (y - p[1]) + nz * (z - p[2])
             distance2[i] = r * r
-            facts[MATCHED] += 1.0
-            if abs(r) < scale:
-                facts[INLIERS] += 1.0
-            if r * r > gate2:
+            robust = weigh_match(facts, r * r, c2, gate2)
+            if robust == 0.0:
                 continue
             # The normal in the LiDAR frame, for the source scatter along it.
             lx = R[0, 0] * nx + R[1, 0] * ny + R[2, 0] * nz
@@ -200,8 +208,6 @@ def linearise(
                 + q[5] * lz * lz
                 + 2.0 * (q[1] * lx * ly + q[2] * lx * lz + q[4] * ly * lz)
             )
-            robust = c2 / (c2 + r * r)
-            robust *= robust
             w = plane_weight * robust / (variance_of(p, r, best_d) + max(spread, 0.0) + sigma2)
             j3, j4, j5 = ry * nz - rz * ny, rz * nx - rx * nz, rx * ny - ry * nx
             add_row(H, g, w, r, nx, ny, nz, j3, j4, j5)
@@ -214,13 +220,9 @@ def linearise(
             drop = 1.0 - axial_weight
             across2 = non_planar_d - drop * (ux * ex + uy * ey + uz * ez) ** 2
             distance2[i] = across2
-            facts[MATCHED] += 1.0
-            if across2 < c2:
-                facts[INLIERS] += 1.0
-            if across2 > gate2:
+            robust = weigh_match(facts, across2, c2, gate2)
+            if robust == 0.0:
                 continue
-            robust = c2 / (c2 + across2)
-            robust *= robust
             q = scatter[i]
             w = non_planar_weight * robust / (p[6] + (q[0] + q[3] + q[5]) / 3.0 + sigma2)
             add_information(

@@ -14,8 +14,8 @@ import numpy as np
 from lslam.core.arrays import Floats, Ints, Longs, Rings
 from lslam.core.kernels.gaussians import find
 from lslam.core.kernels.jit import inline, kernel
-from lslam.core.kernels.linearisation import INLIERS, MATCHED, Pose, Sums, Width
-from lslam.core.kernels.residuals import add_facts, add_row, add_surface, place
+from lslam.core.kernels.linearisation import Pose, Sums, Width
+from lslam.core.kernels.residuals import add_facts, add_row, add_surface, place, weigh_match
 from lslam.core.kernels.voxel import index_of, pack
 from lslam.odometry.kernels.feature_grid import Matches, counterparts
 from lslam.odometry.kernels.lines import add_line
@@ -51,16 +51,12 @@ def _add_point(
     r : m, point relative to the sensor; variance : m2, of e along each axis; c2 : m2, squared width of Geman-McClure
     """
     d2 = ex * ex + ey * ey + ez * ez
-    robust = c2 / (c2 + d2)
-    robust *= robust
+    robust = weigh_match(facts, d2, c2, np.inf)
     w = robust / variance
     add_row(H, g, w, ex, 1.0, 0.0, 0.0, 0.0, rz, -ry)
     add_row(H, g, w, ey, 0.0, 1.0, 0.0, -rz, 0.0, rx)
     add_row(H, g, w, ez, 0.0, 0.0, 1.0, ry, -rx, 0.0)
     add_facts(facts, 3.0 * w, robust * d2, robust, rx, ry, rz)
-    facts[MATCHED] += 1.0
-    if d2 < c2:
-        facts[INLIERS] += 1.0
 
 
 @inline
@@ -79,14 +75,10 @@ def _add_plane(
     c2: float,
 ) -> float:
     """Add a point-to-plane residual e (m) along the unit normal n to H and g; returns its weight; r, c2 : as in `_add_point`."""
-    robust = c2 / (c2 + e * e)
-    robust *= robust
+    robust = weigh_match(facts, e * e, c2, np.inf)
     w = robust / variance
     add_row(H, g, w, e, nx, ny, nz, ry * nz - rz * ny, rz * nx - rx * nz, rx * ny - ry * nx)
     add_facts(facts, w, robust * e * e, robust, rx, ry, rz)
-    facts[MATCHED] += 1.0
-    if abs(e) < math.sqrt(c2):
-        facts[INLIERS] += 1.0
     return w
 
 

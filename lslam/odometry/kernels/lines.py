@@ -13,8 +13,8 @@ import math
 from lslam.core.arrays import Floats, Ints, Longs
 from lslam.core.kernels.jit import inline, kernel
 from lslam.core.kernels.linalg import plane_of
-from lslam.core.kernels.linearisation import INLIERS, MATCHED, Pose, Sums, Width
-from lslam.core.kernels.residuals import TILT_FACTOR, add_facts, add_row, octant_slots, place
+from lslam.core.kernels.linearisation import MATCHED, Pose, Sums, Width
+from lslam.core.kernels.residuals import TILT_FACTOR, add_facts, add_row, octant_slots, place, weigh_match
 from lslam.core.kernels.voxel import MASK, OFFSET
 
 # Moments, keys and table of a voxel pool, see `gaussians`; rows of lines, and the keys and sums they were computed at.
@@ -100,8 +100,7 @@ def add_line(
     along = ex * ux + ey * uy + ez * uz
     ex, ey, ez = ex - along * ux, ey - along * uy, ez - along * uz
     d2 = ex * ex + ey * ey + ez * ez
-    robust = c2 / (c2 + d2)
-    robust *= robust
+    robust = weigh_match(facts, d2, c2, math.inf)
     w = robust / variance
     # Two unit vectors across the line, beginning with the axis that is most nearly across it.
     ax, ay, az = abs(ux), abs(uy), abs(uz)
@@ -117,9 +116,6 @@ def add_line(
     add_row(H, g, w, ex * px + ey * py + ez * pz, px, py, pz, ry * pz - rz * py, rz * px - rx * pz, rx * py - ry * px)
     add_row(H, g, w, ex * qx + ey * qy + ez * qz, qx, qy, qz, ry * qz - rz * qy, rz * qx - rx * qz, rx * qy - ry * qx)
     add_facts(facts, 2.0 * w, robust * d2, robust, rx, ry, rz)
-    facts[MATCHED] += 1.0
-    if d2 < c2:
-        facts[INLIERS] += 1.0
 
 
 @kernel

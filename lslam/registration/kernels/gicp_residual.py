@@ -35,6 +35,7 @@ from lslam.core.kernels.residuals import (
     place,
     thin_information,
     variance_of,
+    weigh_match,
 )
 from lslam.registration.kernels.discs import EXTENT_M2, disc, keep
 
@@ -119,13 +120,9 @@ def linearise_gicp(
         scatter = rotate_symmetric(R, covariance[i])
         mxx, mxy, mxz, myy, myz, mzz, away = certainty_of_pair(p, is_plane, ex, ey, ez, scatter, sigma2, extent2)
         distance2[i] = away
-        facts[MATCHED] += 1.0
-        if away < c2:
-            facts[INLIERS] += 1.0
-        if away > gate2:
+        robust = weigh_match(facts, away, c2, gate2)
+        if robust == 0.0:
             continue
-        robust = c2 / (c2 + away)
-        robust *= robust
         w = robust * (plane_weight if is_plane else non_planar_weight)
         add_information(H, g, w, mxx, mxy, mxz, myy, myz, mzz, ex, ey, ez, rx, ry, rz)
         trace = w * (mxx + myy + mzz)

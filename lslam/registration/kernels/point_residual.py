@@ -5,8 +5,8 @@ from __future__ import annotations
 from lslam.core.arrays import Floats
 from lslam.core.kernels.gaussians import BLOB
 from lslam.core.kernels.jit import kernel
-from lslam.core.kernels.linearisation import INLIERS, MATCHED, Pose, Search, Settings, Sums, Width
-from lslam.core.kernels.residuals import Voxels, add_facts, add_information, octant_slots, place
+from lslam.core.kernels.linearisation import Pose, Search, Settings, Sums, Width
+from lslam.core.kernels.residuals import Voxels, add_facts, add_information, octant_slots, place, weigh_match
 
 
 @kernel
@@ -56,14 +56,10 @@ def linearise_point(
             continue
         is_done[i] = True
         distance2[i] = best_d
-        facts[MATCHED] += 1.0
-        if best_d < c2:
-            facts[INLIERS] += 1.0
-        if best_d > gate2:
+        robust = weigh_match(facts, best_d, c2, gate2)
+        if robust == 0.0:
             continue
         p = planes[best]
-        robust = c2 / (c2 + best_d)
-        robust *= robust
         w = robust * information
         add_information(H, g, w, 1.0, 0.0, 0.0, 1.0, 0.0, 1.0, x - p[0], y - p[1], z - p[2], rx, ry, rz)
         add_facts(facts, 3.0 * w, robust * best_d, robust, rx, ry, rz)
