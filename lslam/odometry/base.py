@@ -160,11 +160,6 @@ class AligningMethod(Traits, ABC):
         return result
 
 
-def keep_prior(T_prior: Floats, count: int) -> RegistrationResult:
-    """The prior (4, 4), for `count` points that nothing is there to align with."""
-    return RegistrationResult(T_prior, source_points=count, inliers=count)
-
-
 class MapMethod(Traits, Stateful):
     """Adapter from scans and motion priors to `Registration`; is_scan_to_scan : the map is the last scan alone."""
 

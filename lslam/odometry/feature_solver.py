@@ -53,44 +53,37 @@ class FeatureNoise:
     least: float = 1.0
 
 
-@dataclass(frozen=True)
-class ScanMatching:
-    """An earlier scan, and how features are aligned with it.
+def solve_on_scan(
+    target: FeatureScan,
+    annealing: Annealing,
+    noise: FeatureNoise,
+    one_to_many: bool,
+    edges: Floats,
+    planes: Floats,
+    T_prior: Floats,
+    directions: Floats = EVERYWHERE,
+) -> RegistrationResult:
+    """Align edges (E, 3) and planar points (P, 3), LiDAR frame, with an earlier scan, starting at `T_prior` (4, 4).
 
     one_to_many : whether a feature is matched with several points of the earlier scan, by the line or plane through them
+    directions : (6, 6) projector of the steps; the result's degenerate directions are among them
     """
-
-    target: FeatureScan
-    annealing: Annealing
-    noise: FeatureNoise
-    one_to_many: bool = True
-
-    def align(
-        self, edges: Floats, planes: Floats, T_prior: Floats, directions: Floats = EVERYWHERE
-    ) -> RegistrationResult:
-        """Align edges (E, 3) and planar points (P, 3), LiDAR frame, with the earlier scan, starting at `T_prior` (4, 4).
-
-        `directions` (6, 6) projects the steps; the result's degenerate directions are among them.
-        """
-        target, noise = self.target, self.noise
-        terms = [
-            Term(linearise, (points,), surfaces, self._settings(sigma), target.matches_of(kind, len(points)))
-            for kind, linearise, points, surfaces, sigma in (
-                ("edges", linearise_edges, edges, target.edges, noise.edge),
-                ("planes", linearise_planes, planes, (*target.planes, target.normals), noise.plane),
-            )
-        ]
-        limits = Limits(
-            noise.weak_share,
-            TIMES_ON_SCAN * noise.least / noise.plane**2,
-            by_surfaces=True,
-            directions=np.ascontiguousarray(directions),
+    terms = [
+        Term(
+            linearise,
+            (points,),
+            surfaces,
+            (float(target.size), float(target.reach), float(sigma) ** 2, one_to_many),
+            target.matches_of(kind, len(points)),
         )
-        matches = Correspondences(len(edges) + len(planes))
-        return optimise(Problem(terms, T_prior, self.annealing, limits, matches))
-
-    def _settings(self, sigma: float) -> tuple[float, float, float, bool]:
-        return float(self.target.size), float(self.target.reach), float(sigma) ** 2, bool(self.one_to_many)
+        for kind, linearise, points, surfaces, sigma in (
+            ("edges", linearise_edges, edges, target.edges, noise.edge),
+            ("planes", linearise_planes, planes, (*target.planes, target.normals), noise.plane),
+        )
+    ]
+    least, along = TIMES_ON_SCAN * noise.least / noise.plane**2, np.ascontiguousarray(directions)
+    limits = Limits(noise.weak_share, least, by_surfaces=True, directions=along)
+    return optimise(Problem(terms, T_prior, annealing, limits, Correspondences(len(edges) + len(planes))))
 
 
 def solve_on_map(
@@ -142,16 +135,18 @@ def remap_solution(result: RegistrationResult, T_prior: Floats) -> RegistrationR
     return replace(result, T_world_lidar=se3.normalise(pose))
 
 
-ScanStep = Callable[[ScanMatching, Features, Floats, StageClock], RegistrationResult]
+# `solve_on_scan` on one scan, as configured.
+Align = Callable[..., RegistrationResult]
+ScanStep = Callable[[Align, Features, Floats, StageClock], RegistrationResult]
 
 
-def joint_step(matching: ScanMatching, features: Features, T_prior: Floats, clock: StageClock) -> RegistrationResult:
+def joint_step(align: Align, features: Features, T_prior: Floats, clock: StageClock) -> RegistrationResult:
     """Edges and planar points together, stage `scan`."""
     with clock.stage("scan"):
-        return matching.align(features.edges.points, features.planes.points, T_prior)
+        return align(features.edges.points, features.planes.points, T_prior)
 
 
-def two_steps(matching: ScanMatching, features: Features, T_prior: Floats, clock: StageClock) -> RegistrationResult:
+def two_steps(align: Align, features: Features, T_prior: Floats, clock: StageClock) -> RegistrationResult:
     """z, roll and pitch from planar points, stage `ground`; then x, y and yaw from edges, stage `edges`.
 
     LeGO-LOAM (Shan and Englot 2018), section IV-D. Axes are the sensor's at the prior. The covariance joins the two, since
@@ -159,10 +154,10 @@ def two_steps(matching: ScanMatching, features: Features, T_prior: Floats, clock
     """
     upright = upright_directions(T_prior)
     with clock.stage("ground"):
-        ground = matching.align(NONE, features.planes.points, T_prior, upright)
+        ground = align(NONE, features.planes.points, T_prior, upright)
     with clock.stage("edges"):
         level = np.eye(6) - upright
-        edges = matching.align(features.edges.points, NONE, ground.T_world_lidar, level)
+        edges = align(features.edges.points, NONE, ground.T_world_lidar, level)
     if ground.covariance is None or edges.covariance is None:
         covariance = None
     else:

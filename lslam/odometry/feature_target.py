@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,10 +24,10 @@ from lslam.odometry.feature_policies import AllPoints
 from lslam.odometry.feature_solver import (
     NONE,
     FeatureNoise,
-    ScanMatching,
     ScanStep,
     remap_solution,
     solve_on_map,
+    solve_on_scan,
 )
 from lslam.registration.attempt import Attempt, Target
 from lslam.registration.history import History, is_more
@@ -122,8 +123,8 @@ class FeatureTarget(Target):
             annealing = replace(annealing, start=c.kernel_max)
         result = RegistrationResult(T_start, ok=False)
         if self.variant.scan_step is not None:
-            matching = ScanMatching(self.scan, annealing, noise, self.loam.matching == "one-to-many")
-            result = attempt.judge(self.variant.scan_step(matching, features, T_start, attempt.clock))
+            align = partial(solve_on_scan, self.scan, annealing, noise, self.loam.matching == "one-to-many")
+            result = attempt.judge(self.variant.scan_step(align, features, T_start, attempt.clock))
             iterations = result.iterations
         if self.map is not None:
             start = result.T_world_lidar if result.ok else T_start

@@ -16,7 +16,7 @@ from lslam.core.geometry import se3, so3
 from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.state import Stateful
-from lslam.odometry.base import AligningMethod, keep_prior
+from lslam.odometry.base import AligningMethod
 from lslam.registration.optimiser import STEP_M, STEP_RAD
 from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_points, small_room
 from lslam.registration.result import RegistrationResult
@@ -71,8 +71,9 @@ class IcpSvd(AligningMethod, Stateful):
     def align(self, prepared: PreparedPoints, T_prior: Floats) -> RegistrationResult:
         """Align with the last registered scan."""
         c = self.limits
-        if self._last is None or len(prepared.source) < MIN_SOURCE_POINTS:
-            return keep_prior(T_prior, len(prepared.source))
+        count = len(prepared.source)
+        if self._last is None or count < MIN_SOURCE_POINTS:
+            return RegistrationResult(T_prior, source_points=count, inliers=count)
         return align_closed_form(
             prepared.source,
             self._last,

@@ -15,7 +15,7 @@ from lslam.core.extras import importing_open3d
 from lslam.core.geometry import se3
 from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import ScanResult
-from lslam.odometry.base import AligningMethod, keep_prior
+from lslam.odometry.base import AligningMethod
 from lslam.registration.preprocessing.prepare import clean_points
 from lslam.registration.result import RegistrationResult
 from lslam.registration.voxel_target import MIN_SOURCE_POINTS
@@ -67,7 +67,7 @@ class Open3dGicp(AligningMethod):
         """Align the cloud with the last registered scan by Open3D; the prior itself without one."""
         count = len(prepared.points)
         if self._last is None or count < MIN_SOURCE_POINTS:
-            return keep_prior(T_prior, count)
+            return RegistrationResult(T_prior, source_points=count, inliers=count)
         registration = self._package.pipelines.registration
         alignment = registration.registration_generalized_icp(
             prepared,

@@ -14,7 +14,7 @@ from lslam.core.extras import importing, install_hint
 from lslam.core.geometry import se3, so3
 from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import ScanResult
-from lslam.odometry.base import AligningMethod, keep_prior
+from lslam.odometry.base import AligningMethod
 from lslam.registration.preprocessing.prepare import clean_points
 from lslam.registration.result import RegistrationResult
 from lslam.registration.voxel_target import MIN_SOURCE_POINTS
@@ -59,7 +59,7 @@ class SmallGicp(AligningMethod):
         """Align prepared points with the map by small_gicp; the prior itself without a map or with too few points."""
         count = 0 if prepared is None else prepared.size()
         if self._target is None or count < MIN_SOURCE_POINTS:
-            return keep_prior(T_prior, count)
+            return RegistrationResult(T_prior, source_points=count, inliers=count)
         target, tree = self._target
         alignment = self._package.align(
             target, prepared, tree, T_prior, max_correspondence_distance=MATCH_REACH_M, num_threads=self._threads

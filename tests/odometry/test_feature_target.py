@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -19,10 +20,10 @@ from lslam.odometry.feature_policies import ALL_POINTS, CONSTRAINED_SCANS, LessP
 from lslam.odometry.feature_solver import (
     NONE,
     FeatureNoise,
-    ScanMatching,
     ScanStep,
     joint_step,
     remap_solution,
+    solve_on_scan,
     two_steps,
     upright_directions,
 )
@@ -140,7 +141,7 @@ def test_edges_alone_find_the_plan_and_planes_the_upright_directions() -> None:
     target = feature_scan(features_at(prior), prior)
     features = features_at(truth, 1)
     upright = upright_directions(prior)
-    ground = ScanMatching(target, ANNEALING, NOISE).align(NONE, features.planes.points, prior, upright)
+    ground = solve_on_scan(target, ANNEALING, NOISE, True, NONE, features.planes.points, prior, upright)
     moved = se3.relative(prior, ground.T_world_lidar)
     np.testing.assert_allclose(moved[:2, 3], 0.0, atol=1e-3)
     assert abs(np.arctan2(moved[1, 0], moved[0, 0])) < 1e-3
@@ -148,7 +149,7 @@ def test_edges_alone_find_the_plan_and_planes_the_upright_directions() -> None:
     np.testing.assert_allclose(upright @ upright, upright, atol=1e-12)
     assert np.trace(upright) == pytest.approx(3.0)
     clock = StageClock()
-    both = two_steps(ScanMatching(target, ANNEALING, NOISE), features, prior, clock)
+    both = two_steps(partial(solve_on_scan, target, ANNEALING, NOISE, True), features, prior, clock)
     assert list(clock.seconds) == ["ground", "edges"]
     assert distance(both.T_world_lidar, truth)[0] < distance(ground.T_world_lidar, truth)[0] < distance(prior, truth)[0]
     assert distance(both.T_world_lidar, truth)[0] < 0.05
@@ -160,7 +161,7 @@ def test_planes_of_two_walls_leave_their_direction_open_and_the_prior_there() ->
     target = feature_scan(features_at(np.eye(4), with_pillars=False), np.eye(4))
     seen = features_at(se3.exp(np.array([0.3, 0.05, 0.03, 0, 0, 0])), 1, with_pillars=False).planes.points
     flat = seen[np.abs(seen[:, 0]) < 5.0]
-    result = ScanMatching(target, ANNEALING, NOISE).align(NONE, flat, prior)
+    result = solve_on_scan(target, ANNEALING, NOISE, True, NONE, flat, prior)
     assert len(result.degenerate) == 1
     along = result.degenerate[0, :3] / np.linalg.norm(result.degenerate[0, :3])
     assert abs(along[0]) > np.cos(np.deg2rad(10))
