@@ -30,7 +30,7 @@ from lslam.io.formats.osm_buildings import BuildingExtract
 from lslam.osm.source import first_pose
 from lslam.osm.track import OsmTrack
 from lslam.osm.wall_match import SEARCH_SIGMAS, START_WALLS, find_heading, match_buildings, match_keyframe, shares
-from lslam.osm.walls import OsmMap, classify, find_walls
+from lslam.osm.walls import OsmMap, classify, find_walls, planar_sigmas
 from lslam.registration.preprocessing.ground import Z, up_of, world_up_of
 
 log = logging.getLogger("lslam")
@@ -97,7 +97,7 @@ def locate(
         start.sigma,
         config.graph.drift_percent,
         np.radians(config.graph.drift_deg_per_100m) / 100,
-        np.array(config.osm.map_sigmas),
+        planar_sigmas(config.osm.map_sigma),
     )
     matches = _both_ways(run, osm, track, clocks)
     accepted = [match for match in matches if match.is_accepted]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Annotated, Literal, Self
 
 from pydantic import BeforeValidator, Field, model_validator
@@ -159,12 +158,6 @@ class GnssConfig(Section):
 
 Weight = Annotated[float, Field(ge=0)]
 Weights = tuple[Weight, Weight, Weight]
-# What is a metre off is turned by so much, one sigma: 35 cm over 10 m, for outlines keep their shape better than their place.
-TURN_DEG_PER_M = 2.0
-
-
-def _sigmas(sigma_m: float) -> tuple[float, float, float]:
-    return sigma_m, sigma_m, math.radians(TURN_DEG_PER_M * sigma_m)
 
 
 class OsmConfig(Section):
@@ -262,16 +255,6 @@ class OsmConfig(Section):
         """The section as the match of a single building takes it: `building_weights`, `building_max_distance`."""
         farthest = self.max_distance if self.building_max_distance is None else self.building_max_distance
         return self.model_copy(update={"weights": self.building_weights or self.weights, "max_distance": farthest})
-
-    @property
-    def map_sigmas(self) -> tuple[float, float, float]:
-        """One sigma of a neighbourhood of the map: x and y, m, and heading, rad."""
-        return _sigmas(self.map_sigma)
-
-    @property
-    def building_sigmas(self) -> tuple[float, float, float]:
-        """Likewise of a building."""
-        return _sigmas(self.building_sigma)
 
     @property
     def needs_labels(self) -> bool:
