@@ -150,8 +150,8 @@ def median_over_seeds(table: Floats) -> Floats:
     return out
 
 
-def over_seeds(table: Floats, level: float = CONFIDENCE) -> Interval:
-    """Mean over the seeds (V, S) that have a number, with Student's t interval of `level`.
+def over_seeds(table: Floats) -> Interval:
+    """Mean over the seeds (V, S) that have a number, with Student's t interval of `CONFIDENCE`.
 
     Seeds are few, so the interval is wide: three of them stand for 4.3 standard errors either way. One has none.
     """
@@ -163,7 +163,7 @@ def over_seeds(table: Floats, level: float = CONFIDENCE) -> Interval:
     several = n > 1
     std, error = np.full(len(n), np.nan), np.full(len(n), np.nan)
     std[several] = np.sqrt(squares[several] / (n[several] - 1))
-    error[several] = std[several] / np.sqrt(n[several]) * t_half_width(level, n[several] - 1)
+    error[several] = std[several] / np.sqrt(n[several]) * t_half_width(CONFIDENCE, n[several] - 1)
     return Interval(mean, mean - error, mean + error, n, std)
 
 

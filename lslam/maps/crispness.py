@@ -47,19 +47,17 @@ def crispness(cloud: Cloud, radius: float = RADIUS, least: int = LEAST_POINTS, s
     return Crispness(entropy, variance, used, sampled, len(cloud), radius, least)
 
 
-def plane_variances(points: Floats, queries: Floats, radius: float = RADIUS, least: int = LEAST_POINTS) -> Floats:
-    """(Q,) m2, variance of the points (N, 3) about the plane through those around each query (Q, 3); NaN where these are few.
-
-    radius : m; least : points within it
-    """
+def plane_variances(points: Floats, queries: Floats) -> Floats:
+    """(Q,) m2, variance of the points (N, 3) about the plane through those around each query (Q, 3); NaN where these are few."""
     from lslam.maps.kernels.crispness import cell_keys, shapes
 
     if not len(points):
         return np.zeros(0)
     low = points.min(0)
-    keys = cell_keys(points, low, radius)
+    keys = cell_keys(points, low, RADIUS)
     order = np.argsort(keys, kind="stable")
-    return np.asarray(shapes(points[order], keys[order], np.ascontiguousarray(queries), low, radius, least)[:, 1])
+    at = np.ascontiguousarray(queries)
+    return np.asarray(shapes(points[order], keys[order], at, low, RADIUS, LEAST_POINTS)[:, 1])
 
 
 def _slabs(cloud: Cloud, radius: float, step: int) -> Iterator[tuple[Floats, Floats]]:

@@ -179,14 +179,8 @@ def _align(
     upright = _upright(source, HEIGHTS)
     points = PreparedPoints(upright.astype(np.float32), upright, np.zeros((len(upright), 6)), len(upright))
     annealing, c = Annealing(WIDTH, STEPS, 0.5, 0.8), RegistrationConfig(sigma=NOISE, weak_share=0.0)
-    found = solve(
-        (ground,),
-        points,
-        se2.to_se3(prior),
-        annealing,
-        c,
-        residual=replace(find_residual(residual), non_planar_weight=1.0),
-    )
+    kind = replace(find_residual(residual), non_planar_weight=1.0)
+    found = solve((ground,), points, se2.to_se3(prior), annealing, c, residual=kind)
     pose = se2.of_se3(found.T_world_lidar)
     if not found.ok or found.overlap < LEAST_OVERLAP or np.linalg.norm(pose[:2] - prior[:2]) > FARTHEST_M:
         return None

@@ -226,15 +226,8 @@ def _at_first_scan(
     at = start.vote.T_level_odometry @ keyframe.T_world_lidar
     C = noise.transport(start.vote.covariance, T[:3, 3] - at[:3, 3])
     c, way = config.loops, keyframe.distance
-    systematic = np.diag(
-        np.repeat(
-            [
-                (0.01 * c.drift_percent * way + LEAST_SIGMA_M) ** 2,
-                np.deg2rad(c.drift_deg * way / 100 + LEAST_SIGMA_DEG) ** 2,
-            ],
-            3,
-        )
-    )
+    move, turn_deg = 0.01 * c.drift_percent * way + LEAST_SIGMA_M, c.drift_deg * way / 100 + LEAST_SIGMA_DEG
+    systematic = np.diag(np.repeat([move**2, np.deg2rad(turn_deg) ** 2], 3))
     return T, np.asarray(C + drift_covariance(way, config.graph) + systematic)
 
 

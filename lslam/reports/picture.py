@@ -16,8 +16,6 @@ from lslam.core.printable import printable
 from lslam.io.formats.atomic import atomic_write
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from lslam.core.arrays import Floats
     from lslam.evaluation.metric import AbsoluteError, Evaluation
     from lslam.io.formats.osm_buildings import BuildingExtract
@@ -82,7 +80,7 @@ def label(plot: Any, x: str, y: str) -> None:
     plot.spines[["top", "right"]].set_visible(False)
 
 
-def write_plot(path: str | Path, evaluations: Sequence[Evaluation], names: Sequence[str] | None = None) -> None:
+def write_plot(path: str | Path, evaluations: Sequence[Evaluation]) -> None:
     """Draw evaluations against one ground truth into `path` (.png, .svg, .pdf), atomically.
 
     Raises UsageError for another suffix, OutputError when the file cannot be written.
@@ -92,8 +90,8 @@ def write_plot(path: str | Path, evaluations: Sequence[Evaluation], names: Seque
     path = Path(path)
     check_plot_path(path)
     with house_style():
-        labels = names or short_names([e.estimate for e in evaluations])
-        figure = _draw(evaluations, [printable(label) for label in labels])
+        labels = [printable(label) for label in short_names([e.estimate for e in evaluations])]
+        figure = _draw(evaluations, labels)
         with atomic_write(path) as stream:
             stream.write(picture(figure, path.suffix.lstrip(".").lower()))
 
@@ -183,10 +181,10 @@ def _colours(count: int) -> list[str]:
     return [COLOURS[k % len(COLOURS)] for k in range(count)]
 
 
-def write_buildings_png(path: Path, extract: BuildingExtract, along: NDArray[Any] | None = None) -> None:
+def write_buildings_png(path: Path, extract: BuildingExtract) -> None:
     """Draw the outlines of `extract` from above in its local frame into a PNG, coloured by height; atomically.
 
-    along : (N, 2) a path in the same frame, m. Raises OutputError when the file cannot be written.
+    Raises OutputError when the file cannot be written.
     """
     from matplotlib import colormaps
     from matplotlib.cm import ScalarMappable
@@ -207,8 +205,6 @@ def write_buildings_png(path: Path, extract: BuildingExtract, along: NDArray[Any
     axes.add_collection(
         PathCollection([s for s, _ in shapes], facecolors=[c for _, c in shapes], edgecolors="black", linewidths=0.5)
     )
-    if along is not None:
-        axes.plot(along[:, 0], along[:, 1], color="#d55e00", lw=1.5)
     axes.autoscale_view()
     axes.set_aspect("equal")
     axes.grid(visible=True, lw=0.3)

@@ -181,8 +181,8 @@ class Crop:
         return points[((points[:, :2] >= (x0, y0)) & (points[:, :2] <= (x1, y1))).all(axis=1)]
 
 
-def choose_crops(points: NDArray[Any], size: float = SIZE_M, most: int = MOST_CROPS) -> list[Crop]:
-    """At most `most` squares of `size` m that do not overlap, those with most structure first.
+def choose_crops(points: NDArray[Any], size: float = SIZE_M) -> list[Crop]:
+    """At most `MOST_CROPS` squares of `size` m that do not overlap, those with most structure first.
 
     Structure is counted in columns of 0.5 m whose points span more than 1 m of height; a square with less than a third of the
     best one's is not worth showing. Empty without any.
@@ -194,7 +194,7 @@ def choose_crops(points: NDArray[Any], size: float = SIZE_M, most: int = MOST_CR
     sums = _window_sums(counts, window, step)
     crops: list[Crop] = []
     best = sums.max(initial=0)
-    while len(crops) < most:
+    while len(crops) < MOST_CROPS:
         row, column = np.unravel_index(int(np.argmax(sums)), sums.shape)
         if sums[row, column] <= best / 3 or sums[row, column] == 0:
             break

@@ -12,6 +12,7 @@ from lslam.core.arrays import Floats
 from lslam.core.geometry import portable
 
 DEGREE = 5
+BEND_RAD = 0.22  # of a winding street
 _REACH = 60  # points from one end after which nothing of it is left: an influence falls by 0.43 from knot to knot
 
 
@@ -149,15 +150,15 @@ def rounded_rectangle(width: float, depth: float, radius: float) -> Floats:
     return np.concatenate([[[0.0, -depth / 2]], *corners])
 
 
-def winding_line(rng: np.random.Generator, length: float, bend: float = 0.22) -> Floats:
+def winding_line(rng: np.random.Generator, length: float) -> Floats:
     """(N, 2) points, m, 1 m apart, of a street of `length` m that begins near the origin, towards +x on the whole.
 
-    Its heading swings by `bend` rad over 200 to 260 m, and by half of that over 150 to 190 m.
+    Its heading swings by `BEND_RAD` over 200 to 260 m, and by half of that over 150 to 190 m.
     """
     s = np.arange(0, length + 1.0)
     heading = np.zeros_like(s)
     for wavelength, share in ((rng.uniform(200, 260), 1.0), (rng.uniform(150, 190), 0.5)):
-        heading += bend * share * portable.sin(2 * np.pi * s / wavelength + rng.uniform(0, 2 * np.pi))
+        heading += BEND_RAD * share * portable.sin(2 * np.pi * s / wavelength + rng.uniform(0, 2 * np.pi))
     steps = np.stack([portable.cos(heading), portable.sin(heading)], axis=1)
     return np.asarray(np.cumsum(steps, axis=0))
 

@@ -39,6 +39,8 @@ from lslam.registration.local_map import surroundings_m
 INFINITE_COVARIANCE = np.diag(np.full(6, np.inf))
 # Scans with points that say when sweeps begin and end.
 _LOOKED_AT = 3
+# Scans that are read before they are asked for.
+_AHEAD = 2
 
 
 def estimate(
@@ -172,7 +174,7 @@ def to_trajectory(results: list[ScanResult], method: str) -> Trajectory:
 
 
 def read_ahead(
-    sequence: Sequence, prepare: Callable[[Scan], Any] | None, threads: int, depth: int = 2, first: int = 0
+    sequence: Sequence, prepare: Callable[[Scan], Any] | None, threads: int, first: int = 0
 ) -> Iterator[ScanInput]:
     """The scans from `first` on, read (and prepared) by one background thread while the caller works on earlier ones."""
     if threads < 2:
@@ -184,7 +186,7 @@ def read_ahead(
         try:
             for i in range(first, len(sequence)):
                 pending.append(pool.submit(copy_context().run, _load, sequence, i, prepare))
-                if len(pending) > depth:
+                if len(pending) > _AHEAD:
                     yield pending.pop(0).result()
             while pending:
                 yield pending.pop(0).result()

@@ -104,28 +104,21 @@ class RingWalk:
     step: float
 
 
-def extract_features(
-    scan: Scan,
-    config: LoamConfig | None = None,
-    gate: PreprocessConfig | None = None,
-    may_be: NDArray[np.uint8] | None = None,
-) -> Features:
+def extract_features(scan: Scan, config: LoamConfig | None = None, gate: PreprocessConfig | None = None) -> Features:
     """Edges and planes of a scan that has rings, by their curvature along the ring (equation 2.21).
 
-    Parameters
-    ----------
     gate : which points are used at all: range and ego box
-    may_be : (N,) of each point of the scan, a sum of MAY_BE_EDGE, MAY_BE_FLAT and MAY_BE_PLANE; None allows all
 
-    Raises
-    ------
-    InputError : the scan has no rings, or neighbours on a ring are too far apart to lie on one surface
+    Raises InputError for a scan without rings, and where neighbours on a ring are too far apart to lie on one surface.
     """
-    return features_along(scan, walk_rings(scan, gate or PreprocessConfig()), config or LoamConfig(), may_be)
+    return features_along(scan, walk_rings(scan, gate or PreprocessConfig()), config or LoamConfig())
 
 
 def features_along(scan: Scan, walk: RingWalk, config: LoamConfig, may_be: NDArray[np.uint8] | None = None) -> Features:
-    """As `extract_features`, of a scan whose rings are walked already."""
+    """As `extract_features`, of a scan whose rings are walked already.
+
+    may_be : (N,) of each point of the scan, a sum of MAY_BE_EDGE, MAY_BE_FLAT and MAY_BE_PLANE; None allows all
+    """
     slope = np.tan(np.radians(PARALLEL_DEG))
     curved, bend, breaks = curvature.curvatures(
         walk.points,
