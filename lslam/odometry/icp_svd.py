@@ -12,7 +12,7 @@ from lslam.core.arrays import Floats, Longs
 from lslam.core.config.config import Config
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.config.odometry import RegistrationConfig
-from lslam.core.geometry import se3, so3
+from lslam.core.geometry import se3
 from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.state import Stateful
@@ -123,7 +123,8 @@ def align_closed_form(
         if not is_determined:
             return RegistrationResult(T_prior, source_points=len(source), converged=False, iterations=rounds)
         T = step @ T
-        if np.linalg.norm(step[:3, 3]) < STEP_M and so3.angle(step[:3, :3]) < STEP_RAD:
+        move, turn = se3.magnitude(step)
+        if move < STEP_M and turn < STEP_RAD:
             converged = True
             break
     rmse = float(np.sqrt(np.mean(distance[near] ** 2))) if len(near) else 0.0

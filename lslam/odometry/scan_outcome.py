@@ -89,8 +89,7 @@ def fault(pose: Floats, stamp_ns: int, last: ScanResult | None) -> str:
         return "the pose is no rigid transform"
     if last is None:
         return ""
-    step = se3.relative(last.T_world_lidar, pose)
-    move, turn = float(np.linalg.norm(step[:3, 3])), float(so3.angle(step[:3, :3]))
+    move, turn = se3.magnitude(se3.relative(last.T_world_lidar, pose))
     seconds = (stamp_ns - last.stamp_ns) * 1e-9
     if move <= FASTEST_M_S * max(seconds, LEAST_S) and turn <= FASTEST_RAD_S * max(seconds, LEAST_S):
         return ""

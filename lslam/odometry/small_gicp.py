@@ -11,7 +11,7 @@ from lslam.core.config.config import Config
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.extras import importing, install_hint
-from lslam.core.geometry import se3, so3
+from lslam.core.geometry import se3
 from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import ScanResult
 from lslam.odometry.base import AligningMethod
@@ -74,9 +74,8 @@ class SmallGicp(AligningMethod):
         )
 
     def _has_moved_on(self, pose: Floats) -> bool:
-        moved = se3.relative(self._T_world_keyframe, pose)
-        is_far = float(np.linalg.norm(moved[:3, 3])) > STEP_M
-        return self._target is None or is_far or float(np.rad2deg(so3.angle(moved[:3, :3]))) > STEP_DEG
+        move, turn = se3.magnitude(se3.relative(self._T_world_keyframe, pose))
+        return self._target is None or move > STEP_M or float(np.rad2deg(turn)) > STEP_DEG
 
     def _insert(self, points: Floats, pose: Floats) -> None:
         self._clouds.append(se3.apply(pose, points))

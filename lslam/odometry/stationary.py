@@ -7,7 +7,7 @@ import numpy as np
 from lslam.core.arrays import Floats
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.config.odometry import RegistrationConfig
-from lslam.core.geometry import se3, so3
+from lslam.core.geometry import se3
 from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.state import Stateful
@@ -74,9 +74,8 @@ class StationaryDetector(Stateful):
             return
         before, self._last = self._last, result
         step = np.eye(4) if before is None else se3.relative(before.T_world_lidar, result.T_world_lidar)
-        turn = float(np.rad2deg(so3.angle(step[:3, :3])))
-        is_slow = float(np.linalg.norm(step[:3, 3])) < SLOW_M and turn < SLOW_DEG
-        if is_slow:
+        move, turn = se3.magnitude(step)
+        if move < SLOW_M and np.rad2deg(turn) < SLOW_DEG:
             self._refer_to(scan)
 
     def warm_up(self) -> None:
@@ -107,5 +106,5 @@ class StationaryDetector(Stateful):
             return False
         if np.trace(C[:3, :3]) > self._limit_m**2 or np.trace(C[3:, 3:]) > self._limit_rad**2:
             return False
-        moved = se3.relative(self._T_own, result.T_world_lidar)
-        return float(np.linalg.norm(moved[:3, 3])) < self._limit_m and float(so3.angle(moved[:3, :3])) < self._limit_rad
+        move, turn = se3.magnitude(se3.relative(self._T_own, result.T_world_lidar))
+        return move < self._limit_m and turn < self._limit_rad

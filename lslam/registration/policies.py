@@ -196,8 +196,8 @@ def _likeliest(non_ground: NonGroundPoints, high: PreparedPoints, T_prior: Float
 
 def is_at_rest(pose: Floats, last: Floats) -> bool:
     """Whether the pose (4, 4) is so near to the last scan's that the sensor's own rings, on roofs or walls, explain it."""
-    move, turn = se3.relative(last, pose)[:3, 3], so3.angle(se3.relative(last, pose)[:3, :3])
-    return bool(np.linalg.norm(move) < 2 * NEAR_M and turn < np.deg2rad(RECOVER_DEG))
+    move, turn = se3.magnitude(se3.relative(last, pose))
+    return bool(move < 2 * NEAR_M and turn < np.deg2rad(RECOVER_DEG))
 
 
 def is_much_more(ours: Bools, others: Bools, margin: float = MUCH_RATIO) -> bool:

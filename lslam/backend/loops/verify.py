@@ -153,8 +153,8 @@ class SubmapRegistration:
 
 def is_elsewhere(T: Floats, other: Floats) -> bool:
     """Whether two poses (4, 4) are of different places."""
-    delta = se3.relative(T, other)
-    return float(np.linalg.norm(delta[:3, 3])) > ELSEWHERE_M or float(so3.angle(delta[:3, :3])) > ELSEWHERE_RAD
+    move, turn = se3.magnitude(se3.relative(T, other))
+    return move > ELSEWHERE_M or turn > float(ELSEWHERE_RAD)
 
 
 @dataclass(frozen=True)

@@ -77,6 +77,11 @@ def normalise(T: NDArray[Any]) -> Floats:
     return make(so3.normalise(T[..., :3, :3]), T[..., :3, 3])
 
 
+def magnitude(T: Floats) -> tuple[float, float]:
+    """How far one motion (4, 4) goes, m, and by how much it turns, rad."""
+    return float(np.linalg.norm(T[:3, 3])), float(so3.angle(T[:3, :3]))
+
+
 def adjoint(T: NDArray[Any]) -> Floats:
     """(..., 6, 6) adjoint: exp(Ad_T xi) = T exp(xi) inv(T), for (translation, rotation) twists."""
     T = np.asarray(T, np.float64)

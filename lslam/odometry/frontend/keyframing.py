@@ -15,7 +15,7 @@ from lslam.core.arrays import Floats, Longs
 from lslam.core.config import Config
 from lslam.core.config.backend import KeyframesConfig
 from lslam.core.config.input import PreprocessConfig
-from lslam.core.geometry import se3, so3
+from lslam.core.geometry import se3
 from lslam.core.kernels import voxel
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
@@ -57,9 +57,8 @@ class KeyframeSelector(Stateful):
     def _is_due(self, pose: Floats) -> bool:
         if self._last is None:
             return True
-        step = se3.relative(self._last, pose)
-        is_far = float(np.linalg.norm(step[:3, 3])) >= self._distance
-        return is_far or float(so3.angle(step[:3, :3])) >= self._angle
+        move, turn = se3.magnitude(se3.relative(self._last, pose))
+        return move >= self._distance or turn >= self._angle
 
 
 # m; centroids are rounded to it. A power of two, so that rounded numbers end in zeros and compress to half; its error,

@@ -10,7 +10,7 @@ from typing import Any, cast
 import numpy as np
 
 from lslam.core.arrays import Floats
-from lslam.core.geometry import se3, so3
+from lslam.core.geometry import se3
 from lslam.core.types.imu import ImuDiagnostics
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import LEVER_M, Scan, Span
@@ -311,5 +311,5 @@ def _distance(before: MotionPrior, after: MotionPrior) -> float:
 
 def apart(a: Floats, b: Floats) -> float:
     """How far two poses (4, 4) are apart, m, at a lever arm of `LEVER_M`."""
-    change = se3.relative(a, b)
-    return float(np.linalg.norm(change[:3, 3]) + LEVER_M * so3.angle(change[:3, :3]))
+    move, turn = se3.magnitude(se3.relative(a, b))
+    return move + LEVER_M * turn

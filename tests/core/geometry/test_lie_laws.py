@@ -51,6 +51,15 @@ def test_compose_with_relative_gives_the_other(a: np.ndarray, b: np.ndarray) -> 
 
 
 @given(twists, twists)
+def test_a_motion_is_as_large_in_any_frame(a: np.ndarray, b: np.ndarray) -> None:
+    move, turn = se3.magnitude(se3.exp(a))
+    assert move == pytest.approx(np.linalg.norm(se3.exp(a)[:3, 3]))
+    assert turn == pytest.approx(np.linalg.norm(a[3:]), abs=1e-9)
+    seen = se3.relative(se3.exp(b), se3.exp(b) @ se3.exp(a))
+    assert se3.magnitude(seen) == pytest.approx((move, turn), abs=1e-7)
+
+
+@given(twists, twists)
 def test_adjoint_moves_twists_through(a: np.ndarray, b: np.ndarray) -> None:
     T = se3.exp(a)
     np.testing.assert_allclose(se3.exp(se3.adjoint(T) @ b * 0.1), T @ se3.exp(b * 0.1) @ se3.inverse(T), atol=1e-9)
