@@ -47,6 +47,7 @@ def best_plane(points: Floats, triples: NDArray[np.int64], tolerance: float, upr
     The best has the highest number of points (N, 3) within `tolerance`, minus those below it: nothing lies under the
     ground. Planes with n z under `upright` are excluded.
     """
+    x, y, z = points[:, 0].copy(), points[:, 1].copy(), points[:, 2].copy()
     best = np.zeros(4)
     best_score = 2
     for k in range(len(triples)):
@@ -63,12 +64,9 @@ def best_plane(points: Floats, triples: NDArray[np.int64], tolerance: float, upr
             continue
         d = -(nx * a[0] + ny * a[1] + nz * a[2])
         score = 0
-        for i in range(len(points)):
-            e = nx * points[i, 0] + ny * points[i, 1] + nz * points[i, 2] + d
-            if e < -tolerance:
-                score -= 1
-            elif e <= tolerance:
-                score += 1
+        for i in range(len(x)):
+            e = nx * x[i] + ny * y[i] + nz * z[i] + d
+            score += (e <= tolerance) - 2 * (e < -tolerance)
         if score > best_score:
             best_score = score
             best[0], best[1], best[2], best[3] = nx, ny, nz, d
