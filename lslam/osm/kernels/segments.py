@@ -194,23 +194,30 @@ def heaviest_run(
 
 @inline
 def reach_out(
-    every: Floats, line: Floats, low: float, high: float, tolerance: float, step: float
+    every: Floats, line: Floats, low: float, high: float, tolerance: float, step: float, along: Floats
 ) -> tuple[float, float]:
-    """Begin and end, m, of a stretch of a line, extended by points of `every` (L, 3) at most `step`, m, beyond an end.
+    """Begin and end, m, of a stretch of a line, extended thrice by points of `every` (L, 3) at most `step`, m, beyond an end.
 
     Near a corner the neighbourhood of a point is two walls and no plane. Such points do not begin a segment, but extend it.
     low, high : m, of the stretch along the line; tolerance : largest distance of a point from the line, m
+    along : (L,) workspace for the positions of the points near the line
     """
-    new_low, new_high = low, high
+    count = 0
     for j in range(len(every)):
         dx, dy = every[j, 0] - line[0], every[j, 1] - line[1]
         if abs(dx * line[2] + dy * line[3]) <= tolerance:
-            s = dy * line[2] - dx * line[3]
+            along[count] = dy * line[2] - dx * line[3]
+            count += 1
+    for _ in range(3):
+        new_low, new_high = low, high
+        for j in range(count):
+            s = along[j]
             if low - step <= s < new_low:
                 new_low = s
             elif new_high < s <= high + step:
                 new_high = s
-    return new_low, new_high
+        low, high = new_low, new_high
+    return low, high
 
 
 @inline
@@ -273,7 +280,7 @@ def find_segments(
     flat = flat.copy()
     found = np.empty((len(tries), 6))
     count = 0
-    line = np.empty(4)
+    line, along = np.empty(4), np.empty(len(every))
     widest = 0.0
     for j in range(len(flat)):
         widest = max(widest, 3.0 * abs(flat[j, 0]), 3.0 * abs(flat[j, 1]))
@@ -291,8 +298,7 @@ def find_segments(
             low, high, _ = heaviest_run(flat, line, tolerance, agreement, gap, bins)
             rms = refit(flat, line, low, high, tolerance, agreement)
         low, high, weight = heaviest_run(flat, line, tolerance, agreement, gap, bins)
-        for _ in range(3):
-            low, high = reach_out(every, line, low, high, tolerance, step)
+        low, high = reach_out(every, line, low, high, tolerance, step, along)
         px, py, nx, ny = line[0], line[1], line[2], line[3]
         if weight >= min_cluster and high - low >= min_length:
             found[count, 0], found[count, 1] = px - low * ny, py + low * nx
