@@ -96,10 +96,6 @@ class FeatureTarget(Target):
             return ""
         return f"only {len(points.edges)} edges and {len(points.planes)} planar points"
 
-    def ready(self, points: Features, history: History) -> Features:
-        """As they are."""
-        return points
-
     def noise(self, history: History) -> FeatureNoise:
         """With the recent variance of the motion prior as threshold of degeneracy.
 

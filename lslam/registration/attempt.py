@@ -48,9 +48,9 @@ class Target(Stateful, ABC):
     def refusal(self, points: Any) -> str:
         """The reason why a scan cannot be registered; empty where it can."""
 
-    @abstractmethod
     def ready(self, points: Any, history: History) -> Any:
-        """The points with all that the residual takes of them."""
+        """The points with all that the residual takes of them; as they are where that is nothing more."""
+        return points
 
     @abstractmethod
     def align(
