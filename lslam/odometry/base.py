@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, ClassVar, Protocol, runtime_checkable
@@ -21,8 +21,12 @@ from lslam.registration.registration import Registration
 from lslam.registration.result import RegistrationResult
 
 
-class Traits:
-    """Properties of a method; those that it does not set have the default values here."""
+class Traits(Protocol):
+    """What all methods have in common: scan + motion prior -> pose, scan after scan.
+
+    Properties that a method does not set have the default values here. `prepare` knows nothing of earlier scans, so the front end
+    runs it for the next scan while `register` works on this one.
+    """
 
     # How it deskews, in words; empty: not at all.
     deskew: str = ""
@@ -33,33 +37,16 @@ class Traits:
     # It can register a sweep again along a course that later scans told as well.
     follows_course: bool = False
 
-    def warm_up(self) -> None:
-        """Nothing to compile."""
-
-
-class Method(Protocol):
-    """What all methods have in common, the attributes of `Traits` among it.
-
-    Scan + motion prior -> pose, scan after scan.
-
-    `prepare` knows nothing of earlier scans, so the front end runs it for the next scan while `register` works on this one.
-    """
-
-    deskew: str
-    needs_rings: bool
-    ignores_prior: bool
-    follows_course: bool
-
     def prepare(self, scan: Scan) -> Any:
-        """Whatever can be made of one scan by itself."""
-        ...
+        """Whatever can be made of one scan by itself; nothing, unless a method says otherwise."""
+        return None
 
     def warm_up(self) -> None:
         """Compile or load what the first scan would otherwise wait for."""
-        ...
+        return
 
 
-class Registering(Method, Protocol):
+class Registering(Traits, Protocol):
     """A method that registers a scan and learns from it at once."""
 
     def register(self, scan: Scan, prepared: Any, prior: MotionPrior) -> ScanResult:
@@ -68,7 +55,7 @@ class Registering(Method, Protocol):
 
 
 @runtime_checkable
-class FeatureSource(Method, Protocol):
+class FeatureSource(Traits, Protocol):
     """A method that sees features, of which a map can be made."""
 
     def features_of(self, prepared: Any, motion: MotionPrior) -> Features:
@@ -77,7 +64,7 @@ class FeatureSource(Method, Protocol):
 
 
 @runtime_checkable
-class Deskewing(Method, Protocol):
+class Deskewing(Traits, Protocol):
     """A method that takes the motion within a sweep from the prior, or begins there and estimates it.
 
     Its `register` only aligns, so that the front end can call it again with the motion that the first alignment found,
@@ -124,7 +111,7 @@ Odometry = Registering | Deskewing
 
 
 @runtime_checkable
-class Resumable(Method, Protocol):
+class Resumable(Traits, Protocol):
     """A method that can leave off after any scan and go on later as if nothing had been, to the last bit."""
 
     def state(self) -> State:
@@ -136,7 +123,7 @@ class Resumable(Method, Protocol):
         ...
 
 
-class AligningMethod(Traits, ABC):
+class AligningMethod(Traits):
     """A method that aligns a scan by itself, or by a package, and is judged by limits of the section `registration`."""
 
     limits: RegistrationConfig

@@ -85,9 +85,6 @@ class GivenPoses(Traits, Stateful):
         self.trajectory = trajectory
         self.motion = GivenMotion(trajectory)
 
-    def prepare(self, scan: Scan) -> None:
-        """Nothing to be made of a scan."""
-
     def register(self, scan: Scan, prepared: None, prior: MotionPrior) -> ScanResult:
         """The trajectory's pose at the scan's stamp; `bridged` where it has a gap."""
         covered = self.motion.covers(scan.stamp_ns)
