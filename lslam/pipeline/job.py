@@ -32,7 +32,7 @@ from lslam.odometry.frontend.checkpoints import Checkpoints, OdometryCheckpoints
 from lslam.odometry.frontend.inertial_start import with_imu_settings
 from lslam.odometry.frontend.point_times import with_point_times
 from lslam.odometry.frontend.register_scans import sweep_of
-from lslam.odometry.frontend.scene_scale import LENGTHS, with_scene_scale, with_up
+from lslam.odometry.frontend.scene_scale import LENGTHS, with_ring_gap, with_scene_scale, with_up
 from lslam.odometry.given import GivenMotion, GivenPoses
 from lslam.odometry.inertial.wheel_motion import Wheels, begin_wheels
 from lslam.osm.source import OsmSource, open_osm
@@ -49,7 +49,11 @@ from lslam.registration.preprocessing.views import WithoutClasses, with_rings
 log = logging.getLogger("lslam")
 
 # What the first scans decide on, unless it is set.
-OPEN_KEYS = (*(f"{section}.{key}" for section, keys in LENGTHS.items() for key in keys), "preprocess.up")
+OPEN_KEYS = (
+    *(f"{section}.{key}" for section, keys in LENGTHS.items() for key in keys),
+    "preprocess.up",
+    "preprocess.ring_gap_deg",
+)
 
 
 @dataclass(frozen=True)
@@ -127,7 +131,7 @@ def fit_to_scene(job: PreparedRun, earlier: Config | None = None) -> PreparedRun
     earlier : configuration of the run to resume, whose values are reused; None without one
     """
     if earlier is None:
-        config = with_up(job.sequence, with_scene_scale(job.config, job.sequence))
+        config = with_ring_gap(with_up(job.sequence, with_scene_scale(job.config, job.sequence)), job.sequence)
     else:
         config = _with_scene_of(earlier, job.config)
     if config == job.config:

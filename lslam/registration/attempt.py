@@ -48,7 +48,7 @@ class Target(Stateful, ABC):
     def refusal(self, points: Any) -> str:
         """The reason why a scan cannot be registered; empty where it can."""
 
-    def ready(self, points: Any, history: History) -> Any:
+    def ready(self, points: Any) -> Any:
         """The points with all that the residual takes of them; as they are where that is nothing more."""
         return points
 

@@ -37,6 +37,8 @@ class GaussianMap(Stateful):
     reach : m, voxels farther than this from the sensor are removed
     capacity : voxels that fit before the arrays are enlarged
     breadth : least spread of a plane's points across the beams that saw them, see `kernels.gaussians`; 0: any
+    ring_gap : rad between neighbouring rings of the sensor; 0: unknown. Where it is known, a voxel must have been seen by
+        several rings, in place of `breadth`
     scan_variance : m2, variance that the points of one scan share, along the normal: of their pose, in a map of several scans
     """
 
@@ -50,12 +52,13 @@ class GaussianMap(Stateful):
         reach: float = 150.0,
         capacity: int = 1 << 16,
         breadth: float = 0.0,
+        ring_gap: float = 0.0,
         scan_variance: float = 0.0,
     ) -> None:
         self.size, self.min_points, self.planarity = size, min_points, planarity
         self.count_cap, self.reach = count_cap, reach
-        self.breadth, self.scan_variance = breadth, scan_variance
-        self.moments = np.zeros((capacity, 13))
+        self.breadth, self.ring_gap, self.scan_variance = breadth, ring_gap, scan_variance
+        self.moments = np.zeros((capacity, 15))
         self.planes = np.zeros((capacity, 8))
         self.keys = np.full(capacity, gaussians.FREE, np.int64)
         self.refreshed = np.zeros(capacity)
@@ -84,6 +87,7 @@ class GaussianMap(Stateful):
             FLOOR_M2,
             self.scan_variance,
             self.breadth,
+            self._ring_variance,
         )
         return gaussians.insert(points, R, t, *rules, self.reach, *self._arrays)
 
@@ -126,6 +130,7 @@ class GaussianMap(Stateful):
             reach=self.reach,
             capacity=capacity,
             breadth=self.breadth,
+            ring_gap=self.ring_gap,
             scan_variance=self.scan_variance,
         )
         gaussians.coarsen(
@@ -136,12 +141,18 @@ class GaussianMap(Stateful):
             FLOOR_M2,
             self.scan_variance,
             self.breadth,
+            self._ring_variance,
             self.moments,
             self.keys,
             int(self.pool[gaussians.USED]),
             *coarse._arrays,
         )
         return coarse
+
+    @property
+    def _ring_variance(self) -> float:
+        """Variance, rad2, of elevations that are spread evenly from one ring to the next."""
+        return self.ring_gap**2 / 12
 
     @property
     def _arrays(self) -> tuple[Any, ...]:

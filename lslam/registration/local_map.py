@@ -1,6 +1,6 @@
 """The local map in a pyramid of resolutions, and the scans that it is made of: all near by, the last keyframes, or one.
 
-A point takes the finest voxel whose points spread across the beams.
+A point takes the finest voxel that several rings have seen.
 """
 
 from __future__ import annotations
@@ -39,13 +39,21 @@ class LocalMap(Stateful):
     Parameters
     ----------
     size : m, edge of a fine voxel
-    reach, scan_variance, breadth : as in `GaussianMap`; None: `LEAST_BREADTH`
+    reach, scan_variance, ring_gap, breadth : as in `GaussianMap`; breadth None: `LEAST_BREADTH`
     """
 
-    def __init__(self, size: float, *, reach: float, scan_variance: float = 0.0, breadth: float | None = None) -> None:
+    def __init__(
+        self,
+        size: float,
+        *,
+        reach: float,
+        scan_variance: float = 0.0,
+        ring_gap: float = 0.0,
+        breadth: float | None = None,
+    ) -> None:
         breadth = LEAST_BREADTH if breadth is None else breadth
         self.levels = tuple(
-            GaussianMap(edge, reach=reach, breadth=breadth, scan_variance=scan_variance)
+            GaussianMap(edge, reach=reach, breadth=breadth, ring_gap=ring_gap, scan_variance=scan_variance)
             for edge in (size, *(size * COARSE_FACTOR * wider for wider in (1, *WIDE_FACTORS)))
         )
         # How often the map has changed: what was looked up in it before is void then.

@@ -115,7 +115,7 @@ class Registration(Stateful):
 
     def attempt(self, points: Any, T_prior: Floats, is_near: bool = False, clock: StageClock | None = None) -> Attempt:
         """The scan as the policies see it."""
-        ready = self.target.ready(points, self.history)
+        ready = self.target.ready(points)
         return Attempt(self.target, ready, T_prior, self.config, self.history, is_near, clock or StageClock())
 
     def update(self, result: RegistrationResult) -> RegistrationResult:

@@ -14,12 +14,10 @@ from lslam.core.kernels.residuals import TILT_FACTOR
 from lslam.registration.alignment import MapAlignment
 from lslam.registration.attempt import Attempt, Target
 from lslam.registration.gaussian_map import FLOOR_M2, source_covariance
-from lslam.registration.history import History
 from lslam.registration.keyframe_submap import KeyframeSubmap
 from lslam.registration.local_map import AllScans, LastKeyframes, LastScan, LocalMap, MapScans
 from lslam.registration.optimiser import KERNEL_MIN_M, Annealing, optimise
 from lslam.registration.preprocessing.prepare import PreparedPoints
-from lslam.registration.preprocessing.rings import ring_gap
 from lslam.registration.residuals import find_residual
 from lslam.registration.result import RegistrationResult
 
@@ -33,19 +31,18 @@ class VoxelTarget(MapAlignment, Target):
     """The local map, the choice of the scans that it is made of, and the residual that the configuration names."""
 
     source = "points"
-    STATE = ("map", "scans", "_ring_gap")
+    STATE = ("map", "scans")
 
     def __init__(self, config: RegistrationConfig, preprocess: PreprocessConfig) -> None:
         residual, scans = find_residual(config.residual or "plane"), make_map_scans(config)
         # The poses of several scans err by the floor; residuals multiply a tilt.
         scan_variance = 0.0 if isinstance(scans, LastScan) else FLOOR_M2 / TILT_FACTOR
         size, reach = config.voxel_size * residual.voxel_share, 1.2 * preprocess.range_max
-        local_map = LocalMap(size, reach=reach, scan_variance=scan_variance)
+        self._ring_gap = preprocess.ring_gap
+        local_map = LocalMap(size, reach=reach, scan_variance=scan_variance, ring_gap=self._ring_gap)
         super().__init__(local_map, config, residual)
         self.times_steps = residual.times_steps
         self.preprocess, self.scans = preprocess, scans
-        # Vertical angular resolution, rad, for point to point; 0 where unknown.
-        self._ring_gap = 0.0
 
     def fresh(self) -> VoxelTarget:
         """An empty one of the same settings."""
@@ -63,10 +60,10 @@ class VoxelTarget(MapAlignment, Target):
         count = len(points.source)
         return "" if count >= MIN_SOURCE_POINTS else f"{count} usable points, {MIN_SOURCE_POINTS} needed"
 
-    def ready(self, points: PreparedPoints, history: History) -> PreparedPoints:
+    def ready(self, points: PreparedPoints) -> PreparedPoints:
         """With the covariance of the surface, or the gap between the rings, at each point, where the residual takes it."""
         points = self.with_covariance(points)
-        return replace(points, gaps=self._gaps(points, history)) if self.kind.needs_gaps else points
+        return replace(points, gaps=self._gaps(points)) if self.kind.needs_gaps else points
 
     def with_covariance(self, points: PreparedPoints) -> PreparedPoints:
         """With the covariance of the surface at each point, where the residual takes it."""
@@ -105,10 +102,8 @@ class VoxelTarget(MapAlignment, Target):
         """The points (M, 3) that the map is made of, m, LiDAR frame."""
         return points.map_points
 
-    def _gaps(self, points: PreparedPoints, history: History) -> Floats | None:
-        """(S,) m, ring spacing at each source point; the angular resolution is estimated from the first scans."""
-        if history.is_young:
-            self._ring_gap = ring_gap(points.map_points)
+    def _gaps(self, points: PreparedPoints) -> Floats | None:
+        """(S,) m, ring spacing at each source point; None where few are farther apart than a voxel is wide."""
         gaps: Floats = self._ring_gap * np.linalg.norm(points.source, axis=1)
         return gaps if (gaps > self.map.fine.size).mean() > SPARSE_SHARE else None
 

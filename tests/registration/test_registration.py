@@ -273,15 +273,12 @@ def test_a_tenth_of_the_points_beyond_a_voxel_between_rings_makes_a_sparse_senso
     share: float, is_sparse: bool
 ) -> None:
     """Rings two degrees apart lie a voxel apart at a distance of 28.6 voxels."""
-    registration = Registration(RegistrationConfig(residual="point"))
-    registration.history.inserted = registration.config.start_scans + 1
-    registration.target._ring_gap = np.deg2rad(2.0)
+    registration = Registration(RegistrationConfig(residual="point"), PreprocessConfig(ring_gap_deg=2.0))
     limit = registration.map.fine.size / np.deg2rad(2.0)
     distances = np.where(np.arange(1000) < 1000 * share, 1.01, 0.99) * limit
     source = distances[:, None] * [0.6, -0.64, 0.48]
-    found = registration.target._gaps(
-        PreparedPoints(np.zeros((0, 3), np.float32), source, np.zeros((1000, 6)), 1000), registration.history
-    )
+    prepared = PreparedPoints(np.zeros((0, 3), np.float32), source, np.zeros((1000, 6)), 1000)
+    found = registration.target.ready(prepared).gaps
     assert (found is not None) == is_sparse
     if found is not None:
         np.testing.assert_allclose(found, np.deg2rad(2.0) * distances)

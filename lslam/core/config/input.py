@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from typing import Annotated, Literal
 
@@ -110,6 +111,9 @@ class PreprocessConfig(Section):
         description="up in the LiDAR frame, of any length; absent: z, unless the IMU, or the ground under the first scans, is "
         "more than 45 deg off",
     )
+    ring_gap_deg: float | None = Field(
+        None, ge=0, description="deg between neighbouring rings; absent: as the first scan shows; 0: unknown"
+    )
     drop_labels: Annotated[tuple[str, ...], BeforeValidator(parse_classes)] = Field(
         (),
         description="classes of points that are left out of everything, by SemanticKITTI's names (moving: all that move), or "
@@ -141,6 +145,11 @@ class PreprocessConfig(Section):
     source_points_max: int = Field(6000, ge=100, description="`target`: more points make the grid coarser")
     random_share: float = Field(0.3, gt=0, le=1, description="`random`: share of points kept")
     seed: int = Field(0, ge=0, description="`random`: seed")
+
+    @property
+    def ring_gap(self) -> float:
+        """rad between neighbouring rings; 0: unknown."""
+        return math.radians(self.ring_gap_deg or 0.0)
 
     @model_validator(mode="after")
     def _check(self) -> PreprocessConfig:

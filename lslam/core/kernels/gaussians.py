@@ -1,8 +1,8 @@
 """The local map's voxels, each a running Gaussian.
 
 Layout, one row per slot of the pool:
-    moments (C, 13) float64 : n, sum x y z, sum xx xy xz yy yz zz, sum of the sensor's x y z when the points were measured,
-        all m and relative to the voxel centre
+    moments (C, 15) float64 : n, sum x y z, sum xx xy xz yy yz zz, sum of the sensor's x y z when the points were measured,
+        all m and relative to the voxel centre; sums of the sines of the beams' elevations, sensor's frame, and their squares
     planes (C, 8) float64 : mean x y z, m, world; unit normal x y z; variance along the normal, m2; tilt, the variance of the
         normal's direction, rad2, or BLOB or EMPTY. One cache line, all that a residual needs.
     keys (C,) int64 : packed voxel, FREE when the slot is unused
@@ -16,6 +16,7 @@ Numbers of all voxels of a map:
     planarity : least (l1 - l0) / l2 of a plane, by the eigenvalues of the covariance of its points, the least first
     floor : m2, added to every variance; common : m2, error that the points of a scan share, for the tilt of a normal
     breadth : least variance across the beams in variances of the surface; 0 disables the test
+    ring_variance : rad2, least variance of the beams' elevations, in place of `breadth`; 0 where rings are unknown
 """
 
 from __future__ import annotations
@@ -36,6 +37,8 @@ EMPTY, BLOB = -2.0, -1.0
 # that bends in its voxel is a strip.
 SOLID_SHARE = 0.1
 USED, FREED, HAND, LIVE = 0, 1, 2, 3
+# m; the direction of a point nearer than this is unknown.
+TINY_M = 1e-9
 
 
 @inline
@@ -104,12 +107,14 @@ def _refresh(
     floor: float,
     common: float,
     breadth: float,
+    ring_variance: float,
 ) -> None:
     """Recompute the row of `planes` of one voxel from its moments: mean, normal, variance, and kind.
 
     The points of one ring of one scan lie on the cone of its beams, and those of the next scan lie on the same cone wherever
-    the sensor has moved: they reflect the scan pattern, not a surface. A voxel of such points is `EMPTY`. A voxel is valid when
-    the variance of its points across the beams is at least `breadth` times that of the surface.
+    the sensor has moved: they reflect the scan pattern, not a surface. A voxel of such points is `EMPTY`. Beams of several
+    rings differ in elevation. Where rings are unknown a voxel is valid when the variance of its points across the beams is at
+    least `breadth` times that of the surface.
     """
     s = moments[slot]
     n = s[0]
@@ -128,7 +133,12 @@ def _refresh(
     l0, l1, l2, nx, ny, nz = plane_of(xx, xy, xz, yy, yz, zz)
     # Planarity (l1 - l0) / l2 is 1 on a disc, 0 on a line or a ball.
     is_plane = l1 - l0 >= planarity * max(l2, 1e-12)
-    if breadth > 0.0:
+    if ring_variance > 0.0:
+        sine = s[13] * w
+        if s[14] * w - sine * sine < ring_variance * (1.0 - sine * sine):
+            p[7] = EMPTY
+            return
+    elif breadth > 0.0:
         across = breadth_of(xx, xy, xz, yy, yz, zz, mx - s[10] * w, my - s[11] * w, mz - s[12] * w)
         if across < (breadth * (max(l0, 0.0) + floor) if is_plane else SOLID_SHARE * l2):
             p[7] = EMPTY
@@ -179,6 +189,7 @@ def insert(
     floor: float,
     common: float,
     breadth: float,
+    ring_variance: float,
     reach: float,
     moments: Floats,
     planes: Floats,
@@ -204,7 +215,7 @@ def insert(
     limit = float(OFFSET - 2)
     mask = len(table) - 1
     ahead, likely, offsets = np.empty(BLOCK, np.int64), np.empty(BLOCK, np.int64), np.empty((BLOCK, 3))
-    views = np.empty((BLOCK, 3))
+    views = np.empty((BLOCK, 4))
     for begin in range(0, n, BLOCK):
         some = 0
         for i in range(begin, min(begin + BLOCK, n)):
@@ -223,6 +234,7 @@ def insert(
                 z - (iz + 0.5) * size,
             )
             views[some, 0], views[some, 1], views[some, 2] = x, y, z
+            views[some, 3] = c / max(math.sqrt(a * a + b * b + c * c), TINY_M)
             some += 1
         # The map is larger than the processor's caches: a batch of voxels is fetched before any branch depends on one.
         for k in range(some):
@@ -258,15 +270,17 @@ def insert(
             s[10] += t[0] - views[k, 0] + dx
             s[11] += t[1] - views[k, 1] + dy
             s[12] += t[2] - views[k, 2] + dz
+            s[13] += views[k, 3]
+            s[14] += views[k, 3] * views[k, 3]
     for j in range(count):
         slot = int(np.int64(touched[j]))  # of one type wherever `_refresh` is called: it is compiled once
         s = moments[slot]
         if s[0] >= 1.1 * counts[slot]:
             if s[0] > cap:
                 w = cap / s[0]
-                for k in range(13):
+                for k in range(15):
                     s[k] *= w
-            _refresh(slot, size, moments, planes, keys, min_points, planarity, floor, common, breadth)
+            _refresh(slot, size, moments, planes, keys, min_points, planarity, floor, common, breadth, ring_variance)
             counts[slot] = s[0]
     _evict(2 * count, t, size, reach, keys, table, state, free, planes)
     return lost
@@ -316,6 +330,7 @@ def coarsen(
     floor: float,
     common: float,
     breadth: float,
+    ring_variance: float,
     fine_moments: Floats,
     fine_keys: Longs,
     pool_size: int,
@@ -362,6 +377,8 @@ def coarsen(
         s[10] += m[10] + n * ox
         s[11] += m[11] + n * oy
         s[12] += m[12] + n * oz
+        s[13] += m[13]
+        s[14] += m[14]
     for slot in range(state[USED]):
-        _refresh(slot, size, moments, planes, keys, min_points, planarity, floor, common, breadth)
+        _refresh(slot, size, moments, planes, keys, min_points, planarity, floor, common, breadth, ring_variance)
         counts[slot] = moments[slot, 0]

@@ -157,7 +157,7 @@ def first_poses(sequence: Sequence, config: Config, motion: InertialMotion | Non
         log.info("the IMU begins %.1f s after the first scan", 1e-9 * (begin_ns - whole.stamps_ns[first]))
     end_ns = begin_ns + round(1e9 * config.imu.start_s)
     few = select(whole, first, max(int(np.searchsorted(whole.stamps_ns[first:], end_ns)), 1))
-    gate = config.preprocess.model_dump(include={"range_min", "range_max", "up", "deskew"})
+    gate = config.preprocess.model_dump(include={"range_min", "range_max", "up", "ring_gap_deg", "deskew"})
     odometry = create_odometry(in_scale(Config.model_validate({"preprocess": gate}), few))
     tracker = Tracker(odometry, motion=motion)
     stamps: list[int] = []

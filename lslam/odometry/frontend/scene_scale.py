@@ -14,6 +14,7 @@ from lslam.core.config import Config
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.errors import InputError
 from lslam.core.types.imu import ImuStream
+from lslam.core.types.scan import has_return
 from lslam.core.types.sequence import Sequence, readable
 from lslam.odometry.inertial.imu_cleaning import gravity_unit
 from lslam.registration.preprocessing.ground import Up, find_up
@@ -79,6 +80,18 @@ def scene_scale(sequence: Sequence) -> float:
         if largest >= 1.0:
             break
     return min(largest, 1.0) or 1.0
+
+
+def with_ring_gap(config: Config, sequence: Sequence) -> Config:
+    """The configuration with `preprocess.ring_gap_deg` as the first scan shows it, unless it is set or no rings show."""
+    if config.preprocess.ring_gap_deg is not None:
+        return config
+    scan = next((scan for _, scan in readable(range(len(sequence)), sequence.scan)), None)
+    gap = 0.0 if scan is None else ring_gap(scan.points[has_return(scan.points[:, :3]), :3])
+    if gap == 0.0:
+        return config
+    known = {"ring_gap_deg": round(float(np.degrees(gap)), 3)}
+    return config.model_copy(update={"preprocess": config.preprocess.model_copy(update=known)})
 
 
 def with_up(sequence: Sequence, config: Config) -> Config:

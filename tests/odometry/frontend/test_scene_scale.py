@@ -6,12 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from stub_sequences import Stub
 
 import lslam
 from lslam.core.config import Config
 from lslam.core.types.scan import Scan
-from lslam.odometry.frontend.scene_scale import scene_scale, with_scene_scale
+from lslam.odometry.frontend.scene_scale import scene_scale, with_ring_gap, with_scene_scale
 
 
 def ball(range_m: float, index: int = 0) -> Scan:
@@ -37,16 +38,30 @@ def test_lengths_are_in_proportion_to_the_range_of_half_of_the_points() -> None:
     assert room.notes[-1] == "a small scene: the voxels of the local map are 0.2 m wide"
 
 
-def test_a_voxel_spans_several_rings() -> None:
-    """Rings two degrees apart, 3 m away: five of them are 0.52 m apart, where a tenth of the range is 0.3 m."""
+def rings(range_m: float) -> Scan:
+    """Sixteen rings two degrees apart."""
     azimuth, elevation = np.meshgrid(np.linspace(-np.pi, np.pi, 400), np.deg2rad(np.arange(-15.0, 16.0, 2.0)))
-    points = 3.0 * np.stack(
+    points = range_m * np.stack(
         [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], axis=-1
     )
-    sparse = Stub([Scan(points.reshape(-1, 3).astype(np.float32), 0, 0)])
+    return Scan(points.reshape(-1, 3).astype(np.float32), 0, 0)
+
+
+def test_a_voxel_spans_several_rings() -> None:
+    """Rings two degrees apart, 3 m away: five of them are 0.52 m apart, where a tenth of the range is 0.3 m."""
+    sparse = Stub([rings(3.0)])
     np.testing.assert_allclose(
         with_scene_scale(Config(), sparse).registration.voxel_size, 5 * 3 * np.deg2rad(2), atol=2e-3
     )
+
+
+def test_the_first_scan_tells_the_gap_between_rings_unless_it_is_set_or_no_rings_show() -> None:
+    found = with_ring_gap(Config(), Stub(["cut short", rings(9.0)]))
+    assert found.preprocess.ring_gap_deg == pytest.approx(2.0, rel=0.02)
+    given = Config.model_validate({"preprocess": {"ring_gap_deg": 0}})
+    assert with_ring_gap(given, Stub([rings(9.0)])) is given
+    assert with_ring_gap(Config(), Stub([ball(9.0)])) == Config()
+    assert with_ring_gap(Config(), Stub(["cut short"])) == Config()
 
 
 def test_lengths_that_are_set_are_kept() -> None:
