@@ -112,7 +112,7 @@ class PreprocessConfig(Section):
         "more than 45 deg off",
     )
     ring_gap_deg: float | None = Field(
-        None, ge=0, description="deg between neighbouring rings; absent: as the first scan shows; 0: unknown"
+        None, ge=0, description="deg; angle between neighbouring rings; absent: as the first scan shows; 0: unknown"
     )
     drop_labels: Annotated[tuple[str, ...], BeforeValidator(parse_classes)] = Field(
         (),

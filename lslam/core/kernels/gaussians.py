@@ -37,8 +37,6 @@ EMPTY, BLOB = -2.0, -1.0
 # that bends in its voxel is a strip.
 SOLID_SHARE = 0.1
 USED, FREED, HAND, LIVE = 0, 1, 2, 3
-# m; the direction of a point nearer than this is unknown.
-TINY_M = 1e-9
 
 
 @inline
@@ -234,7 +232,8 @@ def insert(
                 z - (iz + 0.5) * size,
             )
             views[some, 0], views[some, 1], views[some, 2] = x, y, z
-            views[some, 3] = c / max(math.sqrt(a * a + b * b + c * c), TINY_M)
+            away = math.sqrt(a * a + b * b + c * c)
+            views[some, 3] = c / away if away > 0.0 else 0.0
             some += 1
         # The map is larger than the processor's caches: a batch of voxels is fetched before any branch depends on one.
         for k in range(some):
