@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -136,11 +137,23 @@ def main() -> NoReturn:
         from lslam.cli.console import begin_events
 
         begin_events()  # before the options are read, of which one may be wrong
-    # SIGTERM ends lslam as Ctrl-C does, with exit code 130 and without partly written files.
-    with handle_signals(), _exit_codes():
-        code = cli(standalone_mode=False)
-        is_too_late()
-    sys.exit(code if isinstance(code, int) else 0)
+    try:
+        # SIGTERM ends lslam as Ctrl-C does, with exit code 130 and without partly written files.
+        with handle_signals(), _exit_codes():
+            code = cli(standalone_mode=False)
+            is_too_late()
+        sys.exit(code if isinstance(code, int) else 0)
+    finally:
+        _leave_stderr()
+
+
+def _leave_stderr() -> None:
+    """Redirect stderr to the null device if its reader is gone: Python writes what is left at exit, and fails with code 120."""
+    try:
+        sys.stderr.flush()
+    except OSError:
+        with suppress(OSError, ValueError):  # a stream without a descriptor
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
 
 
 @contextmanager

@@ -181,12 +181,15 @@ def test_a_reader_that_has_left_is_no_error_for_help_either(words: tuple[str, ..
     assert (done.returncode, done.stderr) == (0, b"")
 
 
-def test_an_error_that_nobody_reads_keeps_its_exit_code() -> None:
-    """As of `lslam view` whose terminal was closed."""
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_an_error_that_nobody_reads_keeps_its_exit_code(unbuffered: str) -> None:
+    """As of `lslam view` whose terminal was closed. What a pipe refused stays in a buffer, which Python writes again at exit."""
     reader, writer = os.pipe()
     os.close(reader)
+    env = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
     try:
-        done = subprocess.run([*COMMAND, "methods", "--no-such"], stderr=writer, stdout=subprocess.DEVNULL, check=False)
+        command = [*COMMAND, "methods", "--no-such"]
+        done = subprocess.run(command, stderr=writer, stdout=subprocess.DEVNULL, env=env, check=False)
     finally:
         os.close(writer)
     assert done.returncode == 2
