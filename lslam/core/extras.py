@@ -9,7 +9,6 @@ import contextlib
 import ctypes
 import shlex
 from collections.abc import Callable, Iterator, Mapping
-from functools import cache
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -107,7 +106,6 @@ def find_plugins(group: str, own: Mapping[str, object]) -> dict[str, EntryPoint]
     return {entry.name: entry for entry in entries if entry.name not in own}
 
 
-@cache
 def plugin_versions() -> dict[str, str]:
     """Versions of the packages that register anything for lslam, by their names."""
     from importlib.metadata import entry_points

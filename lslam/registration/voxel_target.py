@@ -18,6 +18,7 @@ from lslam.registration.keyframe_submap import KeyframeSubmap
 from lslam.registration.local_map import AllScans, LastKeyframes, LastScan, LocalMap, MapScans
 from lslam.registration.optimiser import KERNEL_MIN_M, Annealing, optimise
 from lslam.registration.preprocessing.prepare import PreparedPoints
+from lslam.registration.preprocessing.rings import ring_gap
 from lslam.registration.residuals import find_residual
 from lslam.registration.result import RegistrationResult
 
@@ -31,15 +32,16 @@ class VoxelTarget(MapAlignment, Target):
     """The local map, the choice of the scans that it is made of, and the residual that the configuration names."""
 
     source = "points"
-    STATE = ("map", "scans")
+    STATE = ("map", "scans", "_ring_gap")
 
     def __init__(self, config: RegistrationConfig, preprocess: PreprocessConfig) -> None:
         residual, scans = find_residual(config.residual or "plane"), make_map_scans(config)
         # The poses of several scans err by the floor; residuals multiply a tilt.
         scan_variance = 0.0 if isinstance(scans, LastScan) else FLOOR_M2 / TILT_FACTOR
         size, reach = config.voxel_size * residual.voxel_share, 1.2 * preprocess.range_max
-        self._ring_gap = preprocess.ring_gap
-        local_map = LocalMap(size, reach=reach, scan_variance=scan_variance, ring_gap=self._ring_gap)
+        # rad, for point to point; None until the first scan has shown it.
+        self._ring_gap = None if preprocess.ring_gap_deg is None else preprocess.ring_gap
+        local_map = LocalMap(size, reach=reach, scan_variance=scan_variance, ring_gap=preprocess.ring_gap)
         super().__init__(local_map, config, residual)
         self.times_steps = residual.times_steps
         self.preprocess, self.scans = preprocess, scans
@@ -104,6 +106,8 @@ class VoxelTarget(MapAlignment, Target):
 
     def _gaps(self, points: PreparedPoints) -> Floats | None:
         """(S,) m, ring spacing at each source point; None where few are farther apart than a voxel is wide."""
+        if self._ring_gap is None:
+            self._ring_gap = ring_gap(points.map_points)
         gaps: Floats = self._ring_gap * np.linalg.norm(points.source, axis=1)
         return gaps if (gaps > self.map.fine.size).mean() > SPARSE_SHARE else None
 
