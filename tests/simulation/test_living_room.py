@@ -38,9 +38,12 @@ def test_a_walk_through_the_room_is_followed_with_voxels_of_its_size() -> None:
     """
     drive = simulate("room", seed=3, count=25, motion_compensated=True)
     errors = []
-    for settings in ([], ["registration.voxel_size=0.8", "preprocess.map_leaf=0.3", "preprocess.range_min=1.0"]):
+    wide = ["registration.voxel_size=0.8", "preprocess.map_leaf=0.3", "preprocess.range_min=1.0"]
+    # Several rings make planes of wide voxels, too: that they have seen one is left out where widths are compared.
+    no_rings = "preprocess.ring_gap_deg=0"
+    for settings in ([], [no_rings], [no_rings, *wide]):
         config = lslam.load_config(settings=[*settings, "map.write=false", "loops.use=false"])
         ate = lslam.run(drive, config).evaluation.ate["origin"].translation
         errors.append(ate.rmse)
-    assert errors[0] < 0.02
-    assert errors[1] > 3 * errors[0]
+    assert max(errors[:2]) < 0.02
+    assert errors[2] > 4 * errors[1]
