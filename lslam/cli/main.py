@@ -149,6 +149,8 @@ def main() -> NoReturn:
 
 def _leave_stderr() -> None:
     """Redirect stderr to the null device if its reader is gone: Python writes what is left at exit, and fails with code 120."""
+    if sys.stderr is None:  # closed before Python began
+        return
     try:
         sys.stderr.flush()
     except OSError:

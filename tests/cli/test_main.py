@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import subprocess
 import sys
 import tomllib
@@ -179,6 +180,12 @@ def test_a_reader_that_has_left_is_no_error_for_help_either(words: tuple[str, ..
     with os.fdopen(writing, "wb") as nobody:
         done = subprocess.run([*COMMAND, *words], stdout=nobody, stderr=subprocess.PIPE, env=environment(), check=False)
     assert (done.returncode, done.stderr) == (0, b"")
+
+
+@pytest.mark.parametrize(("words", "code"), [("methods", 0), ("methods --no-such", 2)])
+def test_a_stderr_that_was_closed_before_keeps_the_exit_code(words: str, code: int) -> None:
+    command = shlex.join([*COMMAND, *words.split()])
+    assert subprocess.run(["sh", "-c", f"{command} 2>&-"], stdout=subprocess.DEVNULL, check=False).returncode == code
 
 
 @pytest.mark.parametrize("unbuffered", ["", "1"])
