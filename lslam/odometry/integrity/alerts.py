@@ -186,39 +186,58 @@ def _foreign(checks: list[MotionCheck]) -> list[Alert]:
 
 def _jumps(positions: Floats, stamps_ns: Longs) -> list[Alert]:
     """Alerts where the positions (N, 3) change their velocity more than any vehicle could, and the stamps are not the cause."""
-    steps = np.diff(stamps_ns) * 1e-9
-    if len(steps) < 2 or np.any(steps <= 0):
+    seconds = (stamps_ns - stamps_ns[:1]) * 1e-9
+    if len(seconds) < 3 or np.any(np.diff(seconds) <= 0):
         return []
-    change, between = _velocity_changes(positions, steps)
-    # The second of three poses that make a jump is scan k + 1.
-    at = np.flatnonzero(_is_jump(change, between) & ~_is_by_stamps(positions, steps)) + 1
+    jumps: dict[int, tuple[float, float]] = {}
+    for apart in _jump_spans(seconds):
+        change, between = _velocity_changes(positions, seconds, apart)
+        at = np.flatnonzero(_is_jump(change, between) & ~_is_by_stamps(positions, seconds, apart)) + apart
+        # The second of three poses that make a jump; where they contain a faster one, that is meant.
+        slower = [k for k in at.tolist() if all(abs(k - faster) > apart for faster in jumps)]
+        jumps |= {k: (float(change[k - apart] * between[k - apart]), float(between[k - apart])) for k in slower}
     return [
         Alert(
             int(group[0]),
             int(group[-1]) + 1,
-            f"the poses jump, by {np.max(change[group - 1] * between[group - 1]):.1f} m from one scan to the next against "
-            "the motion before: a wrong place, or scans out of order",
+            "the poses jump, by {:.1f} m within {:.2g} s against the motion before: a wrong place, or scans out of order".format(
+                *max(jumps[k] for k in group.tolist())
+            ),
         )
-        for group in _groups(at)
+        for group in _groups(np.array(sorted(jumps), np.int64))
     ]
 
 
 def stamp_faults(positions: Floats, stamps_ns: Longs) -> tuple[list[int], float]:
     """Scans whose wrong stamps alone make the poses jump, by index in the run, and the largest error of a step, s."""
-    steps = np.diff(stamps_ns) * 1e-9
+    seconds = (stamps_ns - stamps_ns[:1]) * 1e-9
+    steps = np.diff(seconds)
     if len(steps) < 2 or np.any(steps <= 0):
         return [], 0.0
-    at = np.flatnonzero(_is_jump(*_velocity_changes(positions, steps)) & _is_by_stamps(positions, steps))
+    at = np.flatnonzero(_is_jump(*_velocity_changes(positions, seconds)) & _is_by_stamps(positions, seconds))
     if not len(at):
         return [], 0.0
     off = np.abs(steps - np.median(steps))
     return (at + 1).tolist(), float(np.max(np.maximum(off[at], off[at + 1])))
 
 
-def _velocity_changes(positions: Floats, steps: Floats) -> tuple[Floats, Floats]:
-    """(N - 2,) changes of the velocity, m/s, of positions (N, 3), m, and the times in which they happen, s."""
-    velocity = np.diff(positions, axis=0) / steps[:, None]
-    return np.linalg.norm(np.diff(velocity, axis=0), axis=1), (steps[1:] + steps[:-1]) / 2
+def _jump_spans(seconds: Floats) -> list[int]:
+    """Numbers of scans between poses that are compared: one, and as many as the least jump takes at `MOST_ACCELERATION_M_S2`.
+
+    A wrong place that the map takes three scans to let go is no jump from one scan to the next.
+    """
+    longest = np.sqrt(OPEN_M / MOST_ACCELERATION_M_S2) / np.median(np.diff(seconds))
+    return sorted({1, min(int(np.ceil(longest)), (len(seconds) - 1) // 2)})
+
+
+def _velocity_changes(positions: Floats, seconds: Floats, apart: int = 1) -> tuple[Floats, Floats]:
+    """(N - 2 apart,) changes of the velocity, m/s, and the times in which they happen, s.
+
+    positions : (N, 3) m, at `seconds` (N,); a velocity is that from a pose to the one so many scans `apart`
+    """
+    velocity = (positions[apart:] - positions[:-apart]) / (seconds[apart:] - seconds[:-apart])[:, None]
+    between = (seconds[2 * apart :] - seconds[: -2 * apart]) / 2
+    return np.linalg.norm(velocity[apart:] - velocity[:-apart], axis=1), between
 
 
 def _is_jump(change: Floats, between: Floats) -> Bools:
@@ -226,13 +245,14 @@ def _is_jump(change: Floats, between: Floats) -> Bools:
     return np.asarray((change / between > MOST_ACCELERATION_M_S2) & (change * between > OPEN_M))
 
 
-def _is_by_stamps(positions: Floats, steps: Floats) -> Bools:
-    """(N - 2,) whether three poses would not jump had their scans followed each other at the period of the sensor.
+def _is_by_stamps(positions: Floats, seconds: Floats, apart: int = 1) -> Bools:
+    """(N - 2 apart,) whether three poses would not jump had their scans followed each other at the period of the sensor.
 
     A rotor keeps its period to a thousandth; stamps that a computer gives when packets arrive do not. A wrong place, or scans
     out of order, stay wrong at any stamps.
     """
-    return ~_is_jump(*_velocity_changes(positions, np.full(len(steps), np.median(steps))))
+    regular = np.arange(len(seconds)) * np.median(np.diff(seconds))
+    return ~_is_jump(*_velocity_changes(positions, regular, apart))
 
 
 def _groups(at: Longs) -> list[Longs]:

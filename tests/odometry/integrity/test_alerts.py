@@ -130,8 +130,21 @@ def test_poses_that_jump_raise_an_alert_without_any_check() -> None:
     positions[10:, 1] = 3.0
     (alert,) = alerts([], positions, stamps_ns)
     assert (alert.first, alert.last) == (9, 11)
-    assert "the poses jump, by 3.0 m" in alert.why
+    assert "the poses jump, by 3.0 m within 0.1 s" in alert.why
     assert stamp_faults(positions, stamps_ns) == ([], 0.0)
+
+
+def test_poses_that_a_map_lets_go_by_and_by_raise_an_alert() -> None:
+    # A corridor at 6 m/s whose first three scans were held in place: no step is off by half a metre, two together are.
+    along = np.array([0.0, 0.0, 0.0, 0.32, 1.01, *(1.01 + 0.6 * np.arange(1, 16))])
+    positions = np.column_stack([along, np.zeros(20), np.zeros(20)])
+    stamps_ns = 100_000_000 * np.arange(20, dtype=np.int64)
+    (alert,) = alerts([], positions, stamps_ns)
+    assert (alert.first, alert.last) == (2, 4)
+    assert "the poses jump, by 1.0 m within 0.2 s" in alert.why
+    # Nothing slows down more than a car that brakes as hard as its tyres let it, twice over.
+    braking = np.column_stack([20 * (t := 0.01 * np.arange(80)) - 9.0 * t**2, 0 * t, 0 * t])
+    assert alerts([], braking, 10_000_000 * np.arange(80, dtype=np.int64)) == []
 
 
 def test_stamps_that_jump_under_steady_poses_are_the_fault_of_the_clock() -> None:
