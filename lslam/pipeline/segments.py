@@ -236,8 +236,8 @@ def _sentence(segment: Segment) -> str:
 
 def raise_alerts(results: list[ScanResult], checks: list[MotionCheck], manifest: Manifest) -> list[ScanResult]:
     """Results with the scans that the integrity monitor contradicts marked lost; the manifest gets a problem for each stretch."""
-    positions, stamps_ns = _positions(results)
-    stretches = alerts(checks, positions, stamps_ns)
+    positions, stamps_ns, frames = _positions(results)
+    stretches = alerts(checks, positions, stamps_ns, frames)
     _check_stamps(results, positions, stamps_ns)
     manifest.integrity = {
         "checks": len(checks),
@@ -284,9 +284,10 @@ def _check_stamps(results: list[ScanResult], positions: Floats, stamps_ns: Longs
         )
 
 
-def _positions(results: list[ScanResult]) -> tuple[Floats, Longs]:
+def _positions(results: list[ScanResult]) -> tuple[Floats, Longs, Longs]:
+    """(N, 3) m, at stamps (N,), ns, in frames (N,)."""
     positions = np.stack([r.at_stamp.T_world_lidar[:3, 3] for r in results])
-    return positions, np.array([r.stamp_ns for r in results])
+    return positions, np.array([r.stamp_ns for r in results]), np.array([r.frame for r in results], np.int64)
 
 
 def _mark(results: list[ScanResult], stretches: list[Alert], manifest: Manifest, after: str) -> list[ScanResult]:

@@ -32,11 +32,18 @@ class Alert:
     why: str
 
 
-def alerts(checks: list[MotionCheck], positions: Floats, stamps_ns: Longs) -> list[Alert]:
-    """All alerts on the `positions` (N, 3), m, of scans at `stamps_ns` (N,), in their order."""
+def alerts(checks: list[MotionCheck], positions: Floats, stamps_ns: Longs, frames: Longs | None = None) -> list[Alert]:
+    """All alerts on the `positions` (N, 3), m, of scans at `stamps_ns` (N,), in their order.
+
+    frames : (N,) in which the positions are given; None: all in one. From one frame to another nothing jumps.
+    """
     rules = (_across_breaks, _inconsistent, _ambiguous, _open, _foreign)
-    of_checks = [alert for rule in rules for alert in rule(checks)]
-    return sorted([*of_checks, *_jumps(positions, stamps_ns)], key=lambda alert: (alert.first, alert.last))
+    found = [alert for rule in rules for alert in rule(checks)]
+    frames = np.zeros(len(positions), np.int64) if frames is None else frames
+    for begin, end in pairwise([0, *(np.flatnonzero(np.diff(frames)) + 1).tolist(), len(frames)]):
+        jumps = _jumps(positions[begin:end], stamps_ns[begin:end])
+        found += [Alert(begin + jump.first, begin + jump.last, jump.why) for jump in jumps]
+    return sorted(found, key=lambda alert: (alert.first, alert.last))
 
 
 def _inconsistent(checks: list[MotionCheck]) -> list[Alert]:
@@ -186,7 +193,7 @@ def _foreign(checks: list[MotionCheck]) -> list[Alert]:
 
 def _jumps(positions: Floats, stamps_ns: Longs) -> list[Alert]:
     """Alerts where the positions (N, 3) change their velocity more than any vehicle could, and the stamps are not the cause."""
-    seconds = (stamps_ns - stamps_ns[:1]) * 1e-9
+    seconds: Floats = (stamps_ns - stamps_ns[:1]).astype(np.float64) * 1e-9
     if len(seconds) < 3 or np.any(np.diff(seconds) <= 0):
         return []
     jumps: dict[int, tuple[float, float]] = {}
@@ -210,7 +217,7 @@ def _jumps(positions: Floats, stamps_ns: Longs) -> list[Alert]:
 
 def stamp_faults(positions: Floats, stamps_ns: Longs) -> tuple[list[int], float]:
     """Scans whose wrong stamps alone make the poses jump, by index in the run, and the largest error of a step, s."""
-    seconds = (stamps_ns - stamps_ns[:1]) * 1e-9
+    seconds: Floats = (stamps_ns - stamps_ns[:1]).astype(np.float64) * 1e-9
     steps = np.diff(seconds)
     if len(steps) < 2 or np.any(steps <= 0):
         return [], 0.0
@@ -251,7 +258,7 @@ def _is_by_stamps(positions: Floats, seconds: Floats, apart: int = 1) -> Bools:
     A rotor keeps its period to a thousandth; stamps that a computer gives when packets arrive do not. A wrong place, or scans
     out of order, stay wrong at any stamps.
     """
-    regular = np.arange(len(seconds)) * np.median(np.diff(seconds))
+    regular: Floats = np.arange(len(seconds)) * np.median(np.diff(seconds))
     return ~_is_jump(*_velocity_changes(positions, regular, apart))
 
 

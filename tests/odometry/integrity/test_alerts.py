@@ -132,6 +132,9 @@ def test_poses_that_jump_raise_an_alert_without_any_check() -> None:
     assert (alert.first, alert.last) == (9, 11)
     assert "the poses jump, by 3.0 m within 0.1 s" in alert.why
     assert stamp_faults(positions, stamps_ns) == ([], 0.0)
+    # A segment that nothing ties to the others has a frame of its own.
+    assert alerts([], positions, stamps_ns, (np.arange(20) < 10).astype(np.int64)) == []
+    assert [a.first for a in alerts([], positions, stamps_ns, (np.arange(20) < 5).astype(np.int64))] == [9]
 
 
 def test_poses_that_a_map_lets_go_by_and_by_raise_an_alert() -> None:
