@@ -110,7 +110,7 @@ def errors_over(way: Floats, nodes: Floats, errors: Floats) -> Floats:
 
 
 def moved_keyframes(keyframes: Sequence[Keyframe], results: Sequence[ScanResult]) -> list[Keyframe]:
-    """The keyframes where their scans are now."""
+    """The keyframes at the poses and covariances of their scans in `results`."""
     return [
         replace(k, T_world_lidar=results[k.scan].T_world_lidar, covariance=results[k.scan].covariance)
         for k in keyframes

@@ -67,7 +67,7 @@ class SweptPoints:
     shares: Floats
 
     def select(self, mask: Bools) -> SweptPoints:
-        """Those of a mask (N,)."""
+        """The points that the mask (N,) selects."""
         return SweptPoints(self.points[mask], self.poses[mask], self.shares[mask])
 
     @classmethod
@@ -167,15 +167,15 @@ class _KnotPrior:
     changes: Floats
 
     def product(self, x: Floats) -> Floats:
-        """(M, 6) of the information with corrections x (M, 6) of all knots."""
+        """Information matrix of the prior times corrections x (M, 6) of all knots."""
         return self._back(np.einsum("skij,skj->ki", self.J, x[self.knots]), len(x))
 
     def gradient(self, count: int) -> Floats:
-        """(count, 6) by the changes so far."""
+        """Gradient (count, 6) of the prior with respect to the knots' corrections, by the poses' changes so far."""
         return self._back(self.changes, count)
 
     def blocks(self, count: int) -> Floats:
-        """(count, 6, 6) on the diagonal, but for what eliminated unknowns take from it."""
+        """Diagonal blocks (count, 6, 6) of the prior's information on the knots, before unknowns are eliminated."""
         out = np.zeros((count, 6, 6))
         np.add.at(out, self.knots, np.swapaxes(self.J, -1, -2) @ self.of_poses.blocks[self.which] @ self.J)
         return out
@@ -204,10 +204,10 @@ def _knot_prior(prior: PosePrior, numbers: Longs, poses: Floats, places: SweptPo
 
 @dataclass(frozen=True)
 class _Sightings:
-    """What each scan saw of each plane, plane after plane.
+    """Points of each plane that each scan saw, summarised, plane after plane.
 
-    starts : (V + 1,) first sighting of each plane; poses, shares : (C,) as of swept points, in the mean
-    means, covariances : (C, 3), (C, 3, 3) of their points, m and m2, world
+    starts : (V + 1,) first sighting of each plane; poses, shares : (C,) mean of those of the swept points
+    means, covariances : (C, 3), (C, 3, 3) of the sightings' points, m and m2, world
     """
 
     starts: Longs

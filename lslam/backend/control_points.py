@@ -84,7 +84,10 @@ def with_control(
 def _position_fix(
     position: Floats, sigma: Floats, own: Floats, stamp_ns: int, results: Many[ScanResult], keyframes: Many[Keyframe]
 ) -> PositionFix:
-    """The factor, between the keyframes around the instant."""
+    """Position factor of a control point, interpolated between the keyframes before and after its instant.
+
+    position, sigma : (3,) m, of the survey; own : (3,) m, the point in the LiDAR frame
+    """
     stamps = [k.stamp_ns for k in keyframes]
     owner = int(np.clip(np.searchsorted(stamps, stamp_ns, side="right") - 1, 0, len(stamps) - 2))
     share = float(np.clip((stamp_ns - stamps[owner]) / (stamps[owner + 1] - stamps[owner]), 0.0, 1.0))
@@ -167,6 +170,7 @@ def contradicting(residuals: Many[ControlResidual], probability: float) -> list[
 
 
 def _some(texts: list[str], what: str) -> list[str]:
+    """The first few of many sentences, and one that counts the others; what : plural noun for them."""
     more = len(texts) - MOST_MESSAGES
     return [*texts[:MOST_MESSAGES], f"and {more} more {what}"] if more > 0 else texts
 

@@ -70,7 +70,7 @@ class Faults:
     facts: dict[str, Any] | None = None
 
     def and_another(self, problem: str, **facts: Any) -> Faults:
-        """With one more."""
+        """The faults with one more: its sentence and its facts for the manifest."""
         return Faults((*self.problems, problem), {**(self.facts or {}), **facts})
 
 
@@ -94,7 +94,7 @@ def clock_of(fixes: Fixes, stamps_ns: Longs, poses: Floats, arm: Floats, level: 
 
 
 def on_clock_of_scans(stream: GnssStream, offset: ClockOffset) -> GnssStream:
-    """The fixes with the stamps that the scans would have given them."""
+    """The fixes with their stamps on the clock of the scans, by the offset."""
     return replace(stream, stamps_ns=stream.stamps_ns + round(1e9 * offset.seconds))
 
 
@@ -195,6 +195,7 @@ def align_fixes(
 
 
 def _axes(sigmas: Floats) -> str:
+    """Sigmas (3,), m, as text."""
     east, north, up = sigmas.tolist()
     return f"{east:.2f}, {north:.2f} and {up:.2f}"
 
@@ -273,6 +274,10 @@ def _consensus(a: Floats, fixes: Floats, sigmas: Floats) -> Floats | None:
 
 
 def _fits(T: Floats, a: Floats, fixes: Floats, sigmas: Floats) -> Bools:
+    """(F,) whether fixes (F, 3) are inliers: within a chi-square limit of the points `a` (F, 3) moved by T (4, 4).
+
+    sigmas : (F, 3) m
+    """
     with np.errstate(invalid="ignore"):
         whitened = ((fixes - se3.apply(T, a)) / sigmas) ** 2
     return np.asarray(np.nan_to_num(whitened.sum(1), nan=np.inf) <= quantile(0.999, 3))

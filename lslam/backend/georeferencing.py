@@ -174,7 +174,7 @@ def final_fixes(sequence: Sequence, results: Many[ScanResult], config: Config) -
 
 
 def _antenna(sequence: Sequence) -> Floats:
-    """(3,) m, in the axes of the LiDAR, at its origin where the calibration does not say."""
+    """(3,) m, antenna position in the LiDAR frame; zero where the calibration lacks it."""
     T_lidar_gnss = sequence.calibration.T_lidar_gnss
     return np.zeros(3) if T_lidar_gnss is None else T_lidar_gnss[:3, 3]
 
@@ -328,7 +328,7 @@ def _fix_noise(
 
 
 def _owners(fixes: Fixes, keyframes: Many[Keyframe]) -> NDArray[np.intp]:
-    """(F,) the keyframe before each fix."""
+    """(F,) index of the keyframe before each fix."""
     stamps = np.array([k.stamp_ns for k in keyframes], np.int64)
     return np.clip(np.searchsorted(stamps, fixes.stamps_ns, side="right") - 1, 0, None)
 

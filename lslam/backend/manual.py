@@ -47,10 +47,11 @@ class _Row:
         return f"{self.path.name}, line {self.line}"
 
     def error(self, what: str) -> InputError:
+        """An InputError that begins with file and line."""
         return InputError(f"{self.path}, line {self.line}: {what}")
 
     def text(self, *names: str) -> str:
-        """The first of these columns that is not empty."""
+        """Text of the first non-empty cell of the columns `names`; empty without one."""
         return next((self.cells[name] for name in names if self.cells.get(name)), "")
 
     def number(self, *names: str) -> float | None:
@@ -67,7 +68,7 @@ class _Row:
         return value
 
     def require(self, *names: str) -> float:
-        """Likewise, where it must not be empty."""
+        """The finite number in the first non-empty of the columns `names`. Raises InputError without one."""
         value = self.number(*names)
         if value is None:
             raise self.error(f"{' or '.join(names)} is empty")
@@ -156,6 +157,10 @@ def write_control(path: Path, residuals: Iterable[ControlResidual]) -> None:
 
 
 def _lidar_point(row: _Row) -> Floats:
+    """(3,) m, the point in the LiDAR frame, zero if its columns are empty.
+
+    Raises InputError where only some of the three are given.
+    """
     values = [row.number(f"lidar_{axis}", f"lidar_{axis}_m") for axis in "xyz"]
     if any(value is None for value in values) and any(value is not None for value in values):
         raise row.error("lidar_x, lidar_y and lidar_z go together")
@@ -242,7 +247,7 @@ def require_instants(instants: Iterable[Instant], numbers: Longs, stamps_ns: Lon
 
 
 def stamp_of(instant: Instant, results: Many[ScanResult]) -> int:
-    """ns; within those of the run."""
+    """Stamp of an instant, ns, clipped to the time of the run."""
     stamps = {result.index: result.stamp_ns for result in results}
     stamp = stamps[instant.scan] if instant.scan is not None else instant.stamp_ns
     assert stamp is not None

@@ -157,7 +157,7 @@ def _compared_with_map(out: BackEnd, graph: PoseGraph, inputs: BackEndInput) -> 
 
 
 def _without_one(graph: PoseGraph, without: Floats, inputs: BackEndInput) -> str:
-    """The end of the sentence about control points that contradict the scans: those without which the others do not."""
+    """End of a sentence on control points that contradict the scans: names those without which the others agree with these."""
     config, points, keyframes = inputs.config, inputs.points, inputs.store.keyframes
     results = bend_scans(inputs.results, keyframes, graph.poses)
     names = []
@@ -181,7 +181,7 @@ def _without_one(graph: PoseGraph, without: Floats, inputs: BackEndInput) -> str
 def _place(
     sequence: Sequence, graph: PoseGraph, inputs: BackEndInput, modes: tuple[str, ...] = ("graph",)
 ) -> Placement:
-    """Placement by fixes, when `gnss.mode` is one of the `modes`, and by control points; empty without both."""
+    """Placement on the Earth by fixes, when `gnss.mode` is one of the `modes`, and by control points; empty without both."""
     placement = _by_fixes(sequence, graph, inputs) if inputs.config.gnss.mode in modes else Placement()
     if not inputs.points:
         return placement
@@ -199,7 +199,7 @@ def _place(
 
 
 def _report(placement: Placement, inputs: BackEndInput) -> Placement:
-    """The placement; its problems are those of the run."""
+    """Add the placement's problems and facts to those of the run; returns it unchanged."""
     texts = (*placement.faults.problems, placement.problem)
     inputs.problems.extend(problem for problem in texts if problem and problem not in inputs.problems)
     inputs.facts.update(placement.faults.facts or {})
@@ -209,7 +209,10 @@ def _report(placement: Placement, inputs: BackEndInput) -> Placement:
 def _by_fixes(
     sequence: Sequence, graph: PoseGraph, inputs: BackEndInput, results: list[ScanResult] | None = None
 ) -> Placement:
-    """Placement of the graph's poses by fixes; results : scans at those poses, None: odometry's, moved with the keyframes."""
+    """Placement of the graph's poses on the Earth by GNSS fixes.
+
+    results : scans at those poses; None: odometry's, corrected as the keyframes were
+    """
     keyframes, config = inputs.store.keyframes, inputs.config
     up = _up(graph)
     if results is None and graph.estimated_drift is None:

@@ -171,7 +171,7 @@ def keep_odometry(inputs: BackEndInput) -> BackEnd:
 
 
 def _odometry(inputs: BackEndInput) -> Floats:
-    """(K, 4, 4) poses of the keyframes."""
+    """(K, 4, 4) poses of the keyframes by odometry."""
     return np.stack([k.T_world_lidar for k in inputs.store.keyframes])
 
 
@@ -217,7 +217,10 @@ def _rescore(georeference: Georeference, graph: PoseGraph, solution: Solution) -
 def _facts(
     solution: Solution, graph: PoseGraph, before: Floats, candidates: list[LoopCandidate], closures: list[Constraint]
 ) -> dict[str, Any]:
-    """For the manifest; before : (K, 4, 4) odometry's poses of the keyframes, in the frame of the graph."""
+    """Facts of the solved graph, for the manifest.
+
+    before : (K, 4, 4) odometry's poses of the keyframes, in the frame of the graph; closures : accepted loop closures
+    """
     moved = se3.relative(before, solution.poses)[:, :3, 3]
     return {
         "loop_candidates": len(candidates),
@@ -239,6 +242,7 @@ def _facts(
 
 
 def _noise_facts(fix_noise: GaussMarkovNoise) -> dict[str, Any]:
+    """Sigmas and time constant of the fixes' correlated noise, for the manifest."""
     east, _, up = (round(float(sigma), 3) for sigma in fix_noise.sigma)
     return {"wandering_fixes": {"horizontal_m": east, "vertical_m": up, "memory_s": round(fix_noise.memory, 1)}}
 
@@ -279,6 +283,7 @@ def view_loop(record: RunRecord, back_end: BackEnd, store: KeyframeStore) -> Loo
 
 
 def _surroundings(poses: Floats, loop: LoopCandidate, store: KeyframeStore) -> LoopSurroundings:
+    """Points and paths near both ends of a loop closure, at the `poses` (K, 4, 4) of the keyframes."""
     older, newer = (
         range(max(end - CLOUD_KEYFRAMES, 0), min(end + CLOUD_KEYFRAMES + 1, len(store))) for end in (loop.a, loop.b)
     )

@@ -16,7 +16,7 @@ _FLOOD = re.compile(r"\S{1000,}")
 
 
 def sentence(text: str) -> str:
-    r"""A text for a terminal: what it would obey escaped, and without the middle of a flood, for it quotes what it was given.
+    r"""A text that is safe to print: control characters are escaped, and the middle of a long run of text is left out.
 
     >>> sentence("9" * 5000).count("9"), sentence("a\x1bb")
     (300, 'a\\x1bb')
@@ -98,7 +98,7 @@ class InterruptedRunError(LslamError):
 
 
 def cause(error: BaseException) -> str:
-    """What went wrong, for a sentence that names the file itself: an OSError's own words bring errno and path again.
+    """The reason of an error for a sentence that already names the file: an OSError's text repeats errno and path.
 
     >>> cause(FileNotFoundError(2, "No such file or directory", "poses.txt"))
     'No such file or directory'
@@ -148,5 +148,5 @@ def nearest(name: str, candidates: Iterable[str]) -> str:
 
 
 def _likeness(name: str, names: str) -> float:
-    """0 to 1, as `get_close_matches` counts it."""
+    """Similarity of two texts, 0 to 1, as `difflib.get_close_matches` computes it."""
     return difflib.SequenceMatcher(None, names, name.lower()).ratio()

@@ -25,12 +25,12 @@ _SOURCES = Path(__file__).resolve().parents[2]
 
 
 def install_hint(extra: str) -> str:
-    """The way out where a library of an extra is missing."""
+    """Sentence that says how to install the extra of a missing library."""
     return f"install it with: {install_command(extra)}"
 
 
 def install_command(extra: str) -> str:
-    """What installs an extra of this lslam, which came from a folder, a file, a repository or an index.
+    """The pip command that installs an extra of this lslam, from the folder, file, repository or index that it came from.
 
     >>> install_command("geo").startswith("pip install ")
     True
@@ -122,13 +122,19 @@ def summarise(group: str, own: Table) -> dict[str, str]:
 
 
 def require(group: str, own: Table, name: str, what: str) -> None:
-    """Raise UsageError with the nearest name when there is no `what` of this name; nothing is imported."""
+    """Raise UsageError with the nearest name when there is no object of this name, of our `own` or an entry point of `group`.
+
+    what : kind of object, for the message. Nothing is imported.
+    """
     if name not in own and name not in (names := summarise(group, own)):
         raise UsageError(f"no {what} {name!r}; {nearest(name, names)}")
 
 
 def factory(group: str, own: Table, name: str, what: str) -> Callable[..., Any]:
-    """What makes the `what` of this name. Raises as `require` and `load`."""
+    """The function that creates the object of this name, of our `own` or an entry point of `group`.
+
+    what : kind of object, for messages. Raises UsageError as `require` and InputError as `load`.
+    """
     if name in own:
         made: Callable[..., Any] = import_module(own[name][0]).create
         return made
@@ -137,7 +143,10 @@ def factory(group: str, own: Table, name: str, what: str) -> Callable[..., Any]:
 
 
 def load(entry: EntryPoint, what: str) -> Any:
-    """The object of an entry point; `what` it is, for messages. Raises InputError naming the package when it is broken."""
+    """The object of an entry point. Raises InputError naming the package when it cannot be imported.
+
+    what : kind of object, for messages
+    """
     try:
         return entry.load()
     except Exception as error:

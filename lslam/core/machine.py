@@ -20,7 +20,7 @@ def available_cores() -> int:
 
 
 def pin_blas() -> None:
-    """Let OpenBLAS, once NumPy and SciPy load it, take one core and kernels that every x86-64 processor has.
+    """Restrict OpenBLAS, before NumPy and SciPy load it, to one core and to code that every x86-64 processor runs.
 
     So sums have one order, and bytes are the same on each machine. Matrices of this program are small: more cores would wait for
     each other, a hundred times as long where others use them.

@@ -45,7 +45,7 @@ def toml_text(tree: dict[str, Any]) -> str:
 
 
 def printable_tree(value: Any) -> Any:
-    """Tables, lists and strings in one another, printable; as they come back from TOML."""
+    """Nested tables, lists and strings with all strings `printable`, and with TOML's types."""
     if isinstance(value, str):
         return printable(value)
     if isinstance(value, dict):
@@ -81,7 +81,7 @@ def significant(value: float | None) -> str:
 
 
 def lasting(seconds: float) -> str:
-    """A time as people say it.
+    """A duration in h, min or s, rounded.
 
     >>> lasting(5400), lasting(200), lasting(8.2)
     ('1.5 h', '3.3 min', '8 s')
@@ -92,12 +92,12 @@ def lasting(seconds: float) -> str:
 
 
 def count_of(number: int, noun: str) -> str:
-    """A number with its noun, in the plural unless it is one."""
+    """A number with its noun, in the plural unless the number is one."""
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
 def first_of(names: Sequence[object]) -> str:
-    """The first of many, with commas between them.
+    """The first few names with commas between them, and the number of the others.
 
     >>> first_of([1, 2]), first_of(range(20))
     ('1, 2', '0, 1, 2, 3, 4, 5, 6, 7 and 12 more')

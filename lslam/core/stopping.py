@@ -46,7 +46,7 @@ class Stop:
         return self._is_asked
 
     def check(self) -> None:
-        """Raise Interrupt when somebody asked: for loops whose callers clean up and know nothing of signals."""
+        """Raise Interrupt if a stop was requested: for loops that know nothing of runs, whose callers clean up."""
         if self._is_asked:
             raise Interrupt
 
@@ -72,13 +72,17 @@ class Stop:
     def on_loss(
         self, hook_arguments: sys.UnraisableHookArgs, report: Callable[[sys.UnraisableHookArgs], object]
     ) -> None:
-        """Python loses what is raised in a finaliser or a callback of LLVM, where compiling spends its time: raise it again."""
+        """Hook for exceptions that Python cannot raise (in finalisers and callbacks of LLVM): an Interrupt is sent again.
+
+        report : the hook for all others
+        """
         if issubclass(hook_arguments.exc_type, KeyboardInterrupt):
             self._come_again()
         else:
             report(hook_arguments)
 
     def _come_again(self) -> None:
+        """Send the signal once more in a moment, since it cannot be handled safely now."""
         self._comes_again = True
         again = Timer(AGAIN_S, signal.pthread_kill, (main_thread().ident, self._number))
         again.daemon = True
@@ -146,13 +150,13 @@ def checking(items: Iterable[T]) -> Iterator[T]:
 
 
 def is_too_late() -> None:
-    """The process ends, and how is decided: signals change nothing any more."""
+    """Ignore signals from now on: the process is about to end, and its exit code is decided."""
     for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)
 
 
 def is_interrupt(error: BaseException) -> bool:
-    """Whether `error` is a signal's, or what foreign code made of it."""
+    """Whether `error` comes from a signal: an Interrupt, or an error that foreign code raised in place of it."""
     cause: BaseException | None = error
     while cause is not None and not isinstance(cause, KeyboardInterrupt):
         cause = cause.__cause__
@@ -160,17 +164,19 @@ def is_interrupt(error: BaseException) -> bool:
 
 
 def _outwards(frame: FrameType | None) -> Iterator[FrameType]:
+    """The frame and its callers, innermost first."""
     while frame is not None:
         yield frame
         frame = frame.f_back
 
 
 def _package(name: str) -> str:
+    """The top-level package of a module's name."""
     return name.partition(".")[0]
 
 
 def _can_raise_in(name: str) -> bool:
-    """Whether raising in this module harms nothing below it."""
+    """Whether an exception raised in code of the module `name` does no harm, unlike in numba, LLVM or the standard library."""
     package = _package(name)
     return name == _BETWEEN_PASSES or (package not in _FOREIGN and package not in sys.stdlib_module_names)
 

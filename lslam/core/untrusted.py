@@ -72,6 +72,7 @@ def is_file(path: str | Path) -> bool:
 
 
 def _whole(digits: str) -> int:
+    """The integer of these digits; raises ValueError beyond 64 bits."""
     if len(digits) > _DIGITS or not -_LARGEST <= int(digits) < _LARGEST:
         raise ValueError(f"the whole number {digits[:_DIGITS]}{'...' * (len(digits) > _DIGITS)} has more than 64 bits")
     return int(digits)
@@ -166,7 +167,7 @@ class _Window:
                 return ""
 
     def take(self, characters: str) -> str:
-        """The next character, which has to be one of those `characters`."""
+        """Consume and return the next character that is not blank; raises an error unless it is one of `characters`."""
         found = self.peek()
         if not found or found not in characters:
             raise self.error(f"Expecting {' or '.join(repr(one) for one in characters)}")
@@ -205,14 +206,14 @@ class _Window:
                 return
 
     def error(self, why: str) -> json.JSONDecodeError:
-        """Error about this place, with its position in the whole text."""
+        """A JSON error with message `why`, at the present position in the whole text."""
         line, column = self._place()
         error = json.JSONDecodeError(why, "", 0)
         error.args = (f"{why}: line {line + 1} column {column + 1} (char {self._passed + self._at})",)
         return error
 
     def _place(self) -> tuple[int, int]:
-        """Lines before this place, and characters before it on its line."""
+        """Present position: number of lines before it, and of characters before it on its line."""
         ends = self._text.count("\n", 0, self._at)
         column = self._at - self._text.rindex("\n", 0, self._at) - 1 if ends else self._column + self._at
         return self._lines + ends, column

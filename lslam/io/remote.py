@@ -194,6 +194,7 @@ class RemotePath(PosixPath):
         return dict(known)
 
     def _kind(self) -> str:
+        """`file`, `directory`, or empty if it does not exist."""
         try:
             return str(self._info()["type"])
         except (FileNotFoundError, NotADirectoryError):
@@ -201,6 +202,7 @@ class RemotePath(PosixPath):
 
 
 def _stat(info: dict[str, Any]) -> os.stat_result:
+    """`stat` result of an entry's attributes."""
     mode = stat.S_IFDIR if info["type"] == "directory" else stat.S_IFREG
     size, changed_ns = int(info.get("size") or 0), _changed_ns(info)
     second = changed_ns // 10**9

@@ -38,11 +38,11 @@ class Traits(Protocol):
     follows_course: bool = False
 
     def prepare(self, scan: Scan) -> Any:
-        """Whatever can be made of one scan by itself; nothing, unless a method says otherwise."""
+        """Computation on one scan that needs no earlier scan; the result goes to `register`. Here nothing is computed: None."""
         return None
 
     def warm_up(self) -> None:
-        """Compile or load what the first scan would otherwise wait for."""
+        """Compile kernels and load packages, so that the first scan need not wait for them. Here nothing."""
         return
 
 
@@ -178,9 +178,10 @@ class MapMethod(Traits, Stateful):
         return None
 
     def restart(self) -> None:
-        """An empty map."""
+        """Begin again with an empty map."""
         self.registration = self.registration.fresh()
         self._uncertainty = self._fresh_uncertainty()
 
     def _fresh_uncertainty(self) -> PoseUncertainty:
+        """The accumulated covariance of a run that begins."""
         return PoseUncertainty(is_scan_to_scan=self._is_scan_to_scan)

@@ -52,7 +52,10 @@ class CtIcp(Icp):
     def register(
         self, scan: Scan, prepared: PreparedPoints, prior: MotionPrior, is_near: bool = False
     ) -> RegistrationResult:
-        """Both poses of the sweep."""
+        """Register the scan with the poses at the begin and the end of its sweep as unknowns.
+
+        With one pose instead while the speed is unknown, and for points without times. `is_near` as for `Registration.locate`.
+        """
         if not self.is_elastic(prepared, prior):
             return super().register(scan, prepared, prior, is_near)
         return self.register_sweep(prepared, self._last.constraints(scan.stamp_ns, prior), prior, is_near)
@@ -70,7 +73,7 @@ class CtIcp(Icp):
         return record
 
     def restart(self) -> None:
-        """An empty map, and no sweep before."""
+        """Begin again with an empty map and without an earlier sweep."""
         super().restart()
         self._last = LastSweep()
 
@@ -137,7 +140,7 @@ class LastSweep(Stateful):
         self._change = FORGETTING_FACTOR * Q + (1.0 - FORGETTING_FACTOR) * np.outer(change, change)
 
     def forget(self) -> None:
-        """The last scan has no sweep, or a wrong one."""
+        """Drop the last sweep: its scan has none, or a wrong one."""
         self._ends = self._covariance = None
 
     def _change_over(self, span_s: float) -> Floats:
@@ -147,4 +150,5 @@ class LastSweep(Stateful):
 
 
 def _ends_ns(stamp_ns: int, sweep: MotionPrior) -> tuple[int, int]:
+    """Begin and end of a sweep, ns."""
     return stamp_ns + round(1e9 * float(sweep.times[0])), stamp_ns + round(1e9 * float(sweep.times[-1]))

@@ -44,7 +44,7 @@ class ElasticSweep:
 
     @classmethod
     def of(cls, prior: MotionPrior) -> ElasticSweep:
-        """Sweep through both ends of the prior, with its course between them where an IMU measured it."""
+        """Sweep from the first to the last pose of the prior; if an IMU measured it, the motion in between is kept (`bend`)."""
         straight = cls(prior.poses[0], prior.poses[-1], prior.times)
         if not prior.is_bent:
             return straight
@@ -70,7 +70,7 @@ class ElasticSweep:
         return MotionPrior(self.times, self.poses)
 
     def move(self, d: Floats) -> ElasticSweep:
-        """Both ends by d (2, 6): t' = t + d[:3], R' = exp(d[3:]) R."""
+        """The sweep with both end poses updated by d (2, 6): t' = t + d[:3], R' = exp(d[3:]) R."""
         begin, end = (
             se3.make(so3.exp(step[3:]) @ pose[:3, :3], pose[:3, 3] + step[:3])
             for step, pose in zip(d, (self.begin, self.end), strict=True)
@@ -101,7 +101,7 @@ class ElasticConstraints:
 
     @classmethod
     def of_course(cls, prior: MotionPrior) -> ElasticConstraints:
-        """Constraints of a sweep whose motion is smoothed with later scans: the map that they made has no skew."""
+        """Constraints of a sweep whose prior is smoothed with later scans: its motion is fixed, and the map has no skew."""
         assert prior.change is not None
         fixed = np.eye(6) / LEAST_SKEW**2
         return cls(ElasticSweep.of(prior), NOTHING, inverse(prior.change), 0.0, np.zeros(6), fixed)
@@ -124,7 +124,7 @@ class ElasticConstraints:
 
 
 def inverse(covariance: Floats) -> Floats:
-    """The information of a covariance, or the other way round."""
+    """Inverse of a covariance or of an information matrix (N, N)."""
     return np.asarray(np.linalg.inv(covariance), np.float64)
 
 
@@ -246,7 +246,10 @@ def register_elastic(
 def _about_own_place(
     H: Floats, g: Floats, sweep: ElasticSweep, shares: Floats, centre: Floats
 ) -> tuple[Floats, Floats]:
-    """The parts' equations about where the sensor was in each of them, not about `centre` (3,)."""
+    """Equations H (K, 6, 6), g (K, 6) of the parts of a sweep, with rotations about the sensor's position in each part.
+
+    The given ones rotate about `centre` (3,); shares : (K,) of the sweep that is over when a part was measured.
+    """
     places = (1.0 - shares)[:, None] * sweep.begin[:3, 3] + shares[:, None] * sweep.end[:3, 3]
     G = np.tile(np.eye(6), (len(shares), 1, 1))
     G[:, :3, 3:] = so3.hat(places - centre)
@@ -265,6 +268,7 @@ def _of_ends_and_skew(H: Floats, g: Floats, shares: Floats) -> tuple[Floats, Flo
 
 
 def _scale(lever: float) -> Floats:
+    """Factors (6,) on a twist that make its rotations comparable with translations at a lever arm, m."""
     return np.array([1.0, 1.0, 1.0, 1.0 / lever, 1.0 / lever, 1.0 / lever])
 
 
@@ -276,7 +280,10 @@ def _weak(H: Floats, lever: float, least: float) -> Floats:
 
 
 def _step(A: Floats, b: Floats, lever: float, least: float) -> Floats:
-    """-inv(A) b in the directions of both ends that more than `least` holds."""
+    """Gauss-Newton step -inv(A) b (18,), zero in eigenvectors of A (18, 18) with less information than `least`.
+
+    Rotations are scaled by `lever`, m.
+    """
     scale = np.tile(_scale(lever), 3)
     values, vectors = np.linalg.eigh(A * np.outer(scale, scale))
     along = vectors.T @ (scale * b)

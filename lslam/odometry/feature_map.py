@@ -62,6 +62,7 @@ class FeatureScan:
         return _normals(self.planes[0])
 
     def _grid(self, part: FeaturePoints) -> Grid:
+        """Grid in the world of one kind of features, given in the LiDAR frame."""
         R, t = np.ascontiguousarray(self.T_world_lidar[:3, :3]), np.ascontiguousarray(self.T_world_lidar[:3, 3])
         return build(part.points, part.rings, R, t, self.size)
 
@@ -70,9 +71,9 @@ class FeatureScan:
         return {}
 
     def matches_of(self, kind: str, count: int) -> Matches:
-        """Matches of `count` edges or planar points, in the state after the last alignment with this scan.
+        """Stored matches of `count` points, `kind` edges or planar points, as the last alignment with this scan left them.
 
-        They save a search wherever a point lies near where one was before, whichever alignment it belongs to.
+        A kernel searches anew only for points that moved away from where they were matched.
         """
         return self._matches.setdefault((kind, count), no_counterparts(count))
 
@@ -142,7 +143,10 @@ class FeatureMap(Stateful):
 
     @property
     def lines(self) -> tuple[Floats, Longs, Floats]:
-        """Rows of `kernels.lines` for the edge voxels, the keys and sums they were computed at; kept up to date by it."""
+        """Lines fitted to the edge voxels, as rows of `kernels.lines`, with the voxels' keys and sums at that time.
+
+        The kernel fits a line again when its voxel has changed.
+        """
         if len(self._lines[0]) != len(self.edges.keys):
             self._lines = _lines_for(self.edges)
         return self._lines
@@ -164,7 +168,7 @@ class FeatureMap(Stateful):
         self._lines = _lines_for(self.edges)
 
     def restore(self, state: State) -> None:
-        """Go on with the voxels of `state`."""
+        """Replace all voxels by those of `state`."""
         super().restore(state)
         self._lines = _lines_for(self.edges)
 
@@ -173,16 +177,17 @@ class FeatureKeyframes(LastKeyframes):
     """Keeps the features of the newest keyframes in a feature map, and no others'."""
 
     def insert(self, target: FeatureMap, cloud: Features, T_world_lidar: Floats) -> None:
-        """Add the features of one scan."""
+        """Add the features of one scan, LiDAR frame, to the map at its pose (4, 4)."""
         target.insert(cloud, T_world_lidar)
 
 
 def thin_planes(features: Features) -> tuple[Floats, Floats]:
-    """Centroids (S, 3) of the less planar points and the scatter (S, 6) behind each."""
+    """Down-sample the less planar points by a grid: centroids (S, 3), m, and scatter (S, 6), m2, of the points behind each."""
     points, _, scatter, _ = voxel.centroids(features.less_planes.points.astype(np.float32), NO_TIMES, WIDE_GRID)
     return points.astype(np.float64), scatter.astype(np.float64)
 
 
 def _lines_for(edges: GaussianMap) -> tuple[Floats, Longs, Floats]:
+    """Empty arrays for the lines of all edge voxels."""
     capacity = len(edges.keys)
     return np.zeros((capacity, 8)), np.full(capacity, -1, np.int64), np.zeros(capacity)

@@ -90,7 +90,7 @@ class AllPoints(Stateful):
         self._icp.update(replace(own, T_world_lidar=result.T_world_lidar, is_rejected=is_rejected))
 
     def _of_recent(self, history: History) -> Registration:
-        """`icp` with all points of the scans that were registered last in its map."""
+        """A registration `icp` whose map has all points of the scans that were registered last."""
         icp = Registration(self._config)
         for points, T_world_lidar in history.recent:
             icp.update(RegistrationResult(T_world_lidar, points=prepare_points(points, icp.preprocess)))

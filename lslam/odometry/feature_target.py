@@ -80,24 +80,24 @@ class FeatureTarget(Target):
         self._keyframes = None if variant.keyframes is None else FeatureKeyframes(*variant.keyframes)
 
     def fresh(self) -> FeatureTarget:
-        """An empty one of the same settings."""
+        """A new target without features, with the same settings."""
         return FeatureTarget(self._whole, self.variant)
 
     def __len__(self) -> int:
         return 0 if self.scan is None else len(self.scan.features.less_planes) + len(self.scan.features.less_edges)
 
     def count(self, points: Features) -> int:
-        """Edges and planar points."""
+        """Number of edges and planar points."""
         return len(points.edges) + len(points.planes)
 
     def refusal(self, points: Features) -> str:
-        """Too few features."""
+        """The reason not to register a scan: it has too few features; else empty."""
         if len(points.less_planes) + len(points.less_edges) >= MIN_SOURCE_POINTS:
             return ""
         return f"only {len(points.edges)} edges and {len(points.planes)} planar points"
 
     def noise(self, history: History) -> FeatureNoise:
-        """With the recent variance of the motion prior as threshold of degeneracy.
+        """The noise of features; the recent error of the motion prior sets below which information a direction is degenerate.
 
         The prior counts at most as one planar point: a sensor on a straight way need not stay on it.
         """
@@ -144,13 +144,16 @@ class FeatureTarget(Target):
         return remap_solution(result, attempt.T_prior) if is_remapped else result
 
     def capture(self, attempt: Attempt) -> RegistrationResult:
-        """Less planar points on coarse planes first, then as usual from there, and judged."""
+        """Align from a prior that may be metres off, and check the result.
+
+        Less planar points are registered on coarse planes first, then features as by `align`.
+        """
         with attempt.clock.stage("start" if attempt.history.starting else "recover"):
             attempt.start = self._start(attempt)
         return attempt.judge(self.align(attempt, attempt.start.T_world_lidar, attempt.annealing))
 
     def on_planes(self, attempt: Attempt, T_start: Floats) -> RegistrationResult:
-        """Edges, and centroids of the less planar points, on fine and coarse planes, judged."""
+        """Align edges and centroids of less planar points with fine and coarse planes of the map, and check the result."""
         c, noise = self.config, self.noise(attempt.history)
         points, scatter = thin_planes(attempt.points)
         annealing = Annealing(c.kernel_max, START_ITERATIONS)
@@ -210,8 +213,10 @@ class FeatureTarget(Target):
         return alone
 
     def _new_map(self, capacity: int) -> FeatureMap:
+        """An empty feature map with room for `capacity` voxels."""
         size = self.loam.feature_map_voxel
         return FeatureMap(size, self._plane_size(size), 1.2 * self._whole.preprocess.range_max, capacity)
 
     def _plane_size(self, size: float) -> float:
+        """Edge, m, of a voxel of planar points, where one of edges has `size`, m."""
         return surface_size(size, self.loam.grid_step)

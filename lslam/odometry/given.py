@@ -62,11 +62,11 @@ class GivenMotion(Stateful, MotionModel):
         return MotionPrior(times, poses_at(self.trajectory.stamps_ns, self.trajectory.poses, instants))
 
     def refine(self, prior: MotionPrior, stamp_ns: int, pose: Floats) -> MotionPrior:
-        """The same: nothing was registered."""
+        """The prior unchanged, since nothing was registered."""
         return prior
 
     def rewind(self, stamp_ns: int, pose: Floats, span: Span) -> MotionPrior:
-        """The same: there is nothing to forget."""
+        """Motion within the sweep of the first scan, as by `sweep`; there is no state to reset."""
         return self.sweep(stamp_ns, span)
 
     def correct(

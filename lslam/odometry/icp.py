@@ -43,7 +43,10 @@ def create(config: Config) -> Icp:
 def registration_of(
     config: Config, residual: str | None = "plane", recovery: RecoveryConfig | None = None, **keys: Any
 ) -> Registration:
-    """Registration of points as configured, but with this residual, section and, unless it is None, this `recovery`."""
+    """The registration of the configuration with another `residual`, other `keys` of its section, and another `recovery`.
+
+    recovery : None keeps the configured one
+    """
     c = config.registration.model_copy(update={"residual": residual, **keys})
     return Registration(c, config.preprocess, recovery or config.recovery)
 

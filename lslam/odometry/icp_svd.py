@@ -38,7 +38,7 @@ class Partners:
 
     @cached_property
     def tree(self) -> cKDTree:
-        """Of the points, to be asked for neighbours."""
+        """Search tree of the points."""
         from scipy.spatial import cKDTree
 
         return cKDTree(self.points, balanced_tree=False, compact_nodes=False)

@@ -51,7 +51,7 @@ class LioMapping(FastLio2):
         return super().map_age + len(self.pending)
 
     def equations(self, stamp_ns: int, result: RegistrationResult) -> tuple[ScanEquations, ...]:
-        """Of a scan that was just registered, none where that failed."""
+        """Normal equations of a scan that was just registered; empty where that failed."""
         self._offered = {}
         if not result.ok or len(self.registration.map) == 0:
             return ()
@@ -59,12 +59,12 @@ class LioMapping(FastLio2):
         return (self._at(stamp_ns, result.points, result.T_world_lidar),)
 
     def equations_at(self, poses: Mapping[int, Floats]) -> tuple[ScanEquations, ...]:
-        """Of scans at other poses (4, 4), by their stamps; none of those that are in the map already."""
+        """Normal equations of the queued scans at other poses (4, 4), by stamp; scans that are in the map already have none."""
         by_stamp = self._offered | {stamp_ns: points for stamp_ns, points, *_ in self.pending}
         return tuple(self._at(stamp_ns, by_stamp[stamp_ns], T) for stamp_ns, T in poses.items() if stamp_ns in by_stamp)
 
     def _at(self, stamp_ns: int, points: PreparedPoints, T: Floats) -> ScanEquations:
-        """As registration weighs the points where it ends."""
+        """Normal equations of the points of a scan at its pose T (4, 4), weighted as in the last step of registration."""
         target, width = self.registration.target, KERNEL_MIN_M
         problem = target.problem(points, T, width, 1)
         return ScanEquations(stamp_ns, T, *normal_equations(problem.terms, T, width, problem.matches))
@@ -88,11 +88,11 @@ class LioMapping(FastLio2):
         self.pending = tuple(one for one, is_due in zip(waiting, due, strict=True) if not is_due)
 
     def warm_up(self) -> None:
-        """As of `icp`, and a small window, which the motion model solves."""
+        """Compile kernels as `icp` does, and those of a small window, which the motion model solves."""
         super().warm_up()
         warm_up_solver()
 
     def restart(self) -> None:
-        """An empty map, and no scan that waits for it."""
+        """Begin again with an empty map and no queued scans."""
         super().restart()
         self.pending, self._offered = (), {}

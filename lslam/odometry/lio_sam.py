@@ -54,7 +54,7 @@ class SmoothedUncertainty(PoseUncertainty):
         self.points = PoseUncertainty()
 
     def alone(self, record: ScanResult, result: RegistrationResult, stamp_ns: int, prior: MotionPrior) -> ScanResult:
-        """The record with `points_covariance`, that of the local map; `result` is the smoother's."""
+        """The record with `points_covariance` (6, 6), by the points alone; `result` is the smoother's registration."""
         entered = result.with_pose(result.T_world_lidar, result.detail) if result.is_accepted else result
         whole, own = self.points.covariances(entered, stamp_ns, prior)
         return record if whole is None or own is None else replace(record, points_covariance=whole - own)
@@ -66,7 +66,7 @@ class SmootherMethod(MapMethod):
     _uncertainty: SmoothedUncertainty
 
     def register(self, scan: Scan, prepared: Any, prior: MotionPrior, is_near: bool = False) -> RegistrationResult:
-        """As of the method; the covariance by the points is kept beside the smoother's."""
+        """Register as the method does, and keep the covariance by the points beside the smoother's."""
         result: RegistrationResult = super().register(scan, prepared, prior, is_near)  # type: ignore[misc]
         return replace(result, detail=result.covariance)
 
@@ -75,6 +75,7 @@ class SmootherMethod(MapMethod):
         return self._uncertainty.alone(super().update(scan, prior, result), result, scan.stamp_ns, prior)
 
     def _fresh_uncertainty(self) -> SmoothedUncertainty:
+        """The accumulated covariances of a run that begins."""
         return SmoothedUncertainty()
 
 

@@ -60,12 +60,12 @@ class LinkedMotion(FilterMotion):
     _last_link: tuple[int, Floats] | None = None
 
     def sweep(self, stamp_ns: int, span: Span) -> MotionPrior:
-        """The motion, with what joins it to the last scan."""
+        """Predicted poses over the `span` of the sweep, with the IMU factor that links them to the last scan's state."""
         prior = super().sweep(stamp_ns, span)
         return replace(prior, link=self._link(prior, stamp_ns))
 
     def refine(self, prior: MotionPrior, stamp_ns: int, pose: Floats) -> MotionPrior:
-        """As of the filter, with what joins it to the last scan: the middle of the sweep is seen from the refined stamp."""
+        """The prior refined as by the filter, with the IMU factor to the last state computed again for the refined pose."""
         refined = super().refine(prior, stamp_ns, pose)
         if refined is prior or prior.link is None:
             return prior
@@ -88,7 +88,7 @@ class LinkedMotion(FilterMotion):
     def correct(
         self, stamp_ns: int, pose: Floats, prior: MotionPrior | None = None, has_registration: bool = True
     ) -> None:
-        """As of the filter; a scan that was denied has its state in the smoother where it was put in the end."""
+        """Update as the filter; of a scan rejected by the IMU, the smoother's state is at the pose where the scan entered."""
         super().correct(stamp_ns, pose, prior, has_registration)
         if self._last_link is not None and self._last_link[0] == self._instant_ns:
             self._last_link = self._last_link[0], self._pose.copy()
@@ -121,6 +121,7 @@ class LinkedMotion(FilterMotion):
         return replace(link, step=_coast(self.estimate, motion, 1e-9 * (instant_ns - before_ns)))
 
     def _state_of(self, state: MotionState) -> NavigationState:
+        """The smoother's state as a state of the filter; the noise of the gyroscope remains."""
         P, before = state.covariance, self.estimate.gyroscope
         gyroscope = Gyroscope(state.gyro_bias, state.gyro_axes, P[GYRO, GYRO], before.rate_variance, before.noise)
         estimate = ImuEstimate(state.velocity, state.gravity, state.accel_bias, gyroscope, P[REST, REST])
@@ -128,6 +129,7 @@ class LinkedMotion(FilterMotion):
 
 
 def _plain(state: NavigationState) -> MotionState:
+    """A filter's state as the smoother takes it."""
     e = state.estimate
     return MotionState(
         state.T_world_imu, e.velocity, e.gravity, e.accel_bias, e.gyroscope.bias, e.gyroscope.axes, state.covariance
@@ -254,7 +256,7 @@ class Lips(Traits, Stateful):
         return replace(record, stages={**result.stages, "update": time.perf_counter() - began})
 
     def restart(self) -> None:
-        """An empty window."""
+        """Begin again without a window."""
         self.window = None
 
     def warm_up(self) -> None:
@@ -263,7 +265,7 @@ class Lips(Traits, Stateful):
         warm_up_solver()
 
     def _predict(self, link: SweepLink) -> PlaneWindow:
-        """The window with one more state where the IMU leads, or its first."""
+        """The window with one more state, predicted by the IMU; a new window of one state if the link has no step."""
         if self.window is None or link.step is None:
             return PlaneWindow.begin(link.state, se3.inverse(link.T_lidar_imu))
         return self.window.extend(link.step)

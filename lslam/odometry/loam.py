@@ -102,7 +102,10 @@ _TOGETHER = (("edges", "planes"), ("less_edges", "less_planes", "neither"))
 
 
 def deskew_features(features: Features, prior: MotionPrior) -> Features:
-    """The features as seen from the pose at the stamp, each when it is asked for: a scan that is registered twice enters once."""
+    """The features as seen from the pose at the stamp.
+
+    Points are deskewed when first read, those for the map only once the map takes them.
+    """
     parts: dict[str, FeaturePoints] = {}
     for names in _TOGETHER:
         group = _SweepFeatures([getattr(features, name) for name in names], prior)
@@ -111,7 +114,7 @@ def deskew_features(features: Features, prior: MotionPrior) -> Features:
 
 
 class _SweepFeatures:
-    """Parts of a scan's features, and the motion that displaces them."""
+    """Parts of a scan's features (edges, planar points, ...) that are deskewed together by `prior` when first needed."""
 
     def __init__(self, parts: list[FeaturePoints], prior: MotionPrior) -> None:
         self.parts, self._prior = parts, prior
@@ -126,7 +129,7 @@ class _SweepFeatures:
 
 
 class _SweepPart(FeaturePoints):
-    """One of the parts."""
+    """One part of a scan's features, whose points are deskewed when they are first read."""
 
     _group: _SweepFeatures
     _k: int

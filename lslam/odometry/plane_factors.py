@@ -147,14 +147,14 @@ class Sightings:
 
     @classmethod
     def none(cls) -> Sightings:
-        """No sighting."""
+        """Empty sightings."""
         return cls(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)))
 
     def __len__(self) -> int:
         return len(self.states)
 
     def only(self, which: Bools) -> Sightings:
-        """Some of them."""
+        """The sightings that the mask `which` (K,) selects."""
         return Sightings(self.states[which], self.planes[which], self.cp[which], self.information[which])
 
     def join(self, more: Sightings) -> Sightings:

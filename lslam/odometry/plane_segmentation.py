@@ -203,7 +203,7 @@ class PlaneExtractor:
         )
 
     def _common(self, cp: Floats) -> Floats:
-        """(3, 3) m2 of what all points of a plane are off by together."""
+        """(3, 3) m2 covariance of a closest point (3,) by the error that all points of the plane share."""
         n, d = to_hesse(cp)
         along = np.outer(n, n)
         return np.asarray(self.common_m**2 * along + (self.common_rad * float(d)) ** 2 * (np.eye(3) - along))
@@ -211,6 +211,8 @@ class PlaneExtractor:
 
 @dataclass(frozen=True)
 class _Moments:
+    """Moments of points: their number, mean (3,), covariance (3, 3), m2, and its ascending eigenvalues (3,)."""
+
     count: float
     mean: Floats
     scatter: Floats
@@ -218,7 +220,10 @@ class _Moments:
 
 
 def _fit(counts: Floats, means: Floats, scatters: Floats) -> tuple[Floats, float, _Moments]:
-    """Normal (3,), distance and moments of the points of voxels, from the moments of each."""
+    """Fit the plane n . x = d to the points of voxels: n (3,), d (m) and the moments of all points.
+
+    counts (V,), means (V, 3), m, scatters (V, 3, 3), m2 : moments of each voxel's points
+    """
     count = float(counts.sum())
     mean = np.einsum("v,vi->i", counts, means) / count
     off = means - mean
@@ -282,7 +287,7 @@ class _Cells:
         return np.asarray(region[label == label[at[0]]])
 
     def _on(self, some: Longs, n: Floats, d: float) -> Bools:
-        """Which of some voxels have their points on the plane n . x = d, and do not face elsewhere."""
+        """Mask of the voxels `some` whose points lie on the plane n . x = d, and whose normals, if any, are like n (3,)."""
         is_alike = (self.tilts[some] <= 0) | (np.abs(np.einsum("vi,i->v", self.normals[some], n)) > ALIKE_COSINE)
         return np.asarray((self._off(some, n, d) < ON_PLANE_M**2) & is_alike)
 
@@ -294,7 +299,7 @@ class _Cells:
 
 @dataclass(frozen=True)
 class _Seeds:
-    """Where planes may begin: the cell (S,) there, a point and a normal (S, 3) of each; the radii in which they grow."""
+    """Seeds of region growing: nearest cell, point, m, and normal (S, 3) of each, and the `radii` of growth, m."""
 
     cells: Longs
     means: Floats
@@ -303,7 +308,10 @@ class _Seeds:
 
     @classmethod
     def of(cls, cells: _Cells, planes: Floats, size: int = 1) -> _Seeds:
-        """Seeds at the voxels `planes` (V, 8) that are planar, most certain first; `size` : edge of such a voxel, in cells."""
+        """Seeds at the planar ones of the voxels `planes` (V, 8), most certain first, each at the nearest of the `cells`.
+
+        planes : mean, normal, variance, and tilt variance, positive on planes; size : edge of such a voxel, in cells
+        """
         planes = planes[planes[:, 7] > 0]
         planes = planes[np.argsort(planes[:, 7], kind="stable")]
         nearest = np.zeros(0, np.int64)

@@ -53,11 +53,11 @@ class Landmarks:
         return len(self.unseen)
 
     def only(self, which: Bools) -> Landmarks:
-        """Some of them."""
+        """The landmarks that the mask `which` (M,) selects."""
         return Landmarks(self.anchors[which], self.lows[which], self.highs[which], self.unseen[which])
 
     def observe(self, which: Longs, lows: Floats, highs: Floats) -> Landmarks:
-        """After planes `which` (K,) were seen within boxes (K, 3) and all others were not."""
+        """The landmarks after a scan saw the planes `which` (K,), whose boxes grow to (K, 3), and missed all others."""
         low, high, unseen = self.lows.copy(), self.highs.copy(), self.unseen + 1
         np.minimum.at(low, which, lows)
         np.maximum.at(high, which, highs)
@@ -90,7 +90,7 @@ class PlaneWindow:
 
     @classmethod
     def begin(cls, state: MotionState, T_imu_lidar: Floats) -> PlaneWindow:
-        """One state that is known as the motion model says, and no planes."""
+        """A window of one state, with the motion model's covariance as its prior, and no planes."""
         values = WindowValues.begin(state)
         C = state.covariance[np.ix_(ORDER, ORDER)]
         information = linalg.inverse(C)
@@ -171,13 +171,13 @@ class PlaneWindow:
 
     @property
     def _older(self) -> Bools:
-        """(N,) the states but the newest."""
+        """Mask (N,) of the variables of all states but the newest."""
         out = np.zeros(self.values.size, bool)
         out[SHARED : self.values.first_plane - STATE_SIZE] = True
         return out
 
     def marginalise(self) -> PlaneWindow:
-        """Without the oldest state where there are more than `LAG_SCANS`, and without planes that were not seen for long."""
+        """The window without its oldest state if it has more than `LAG_SCANS`, and without planes not seen for long."""
         window = self
         while window.values.states > LAG_SCANS:
             window = window._without_oldest()

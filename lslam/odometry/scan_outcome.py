@@ -21,7 +21,10 @@ from lslam.registration.voxel_target import MIN_SOURCE_POINTS
 
 
 def to_scan_result(scan: Scan, result: RegistrationResult, covariance: Floats | None, own: Floats | None) -> ScanResult:
-    """Result of a scan from its registration; covariance : (6, 6) of the world pose; own : relative to the local map."""
+    """Result of a scan from its registration.
+
+    covariance, own : (6, 6) of the pose in the world and relative to the local map
+    """
     return ScanResult(
         index=scan.index,
         stamp_ns=scan.stamp_ns,

@@ -74,16 +74,18 @@ class SmallGicp(AligningMethod):
         )
 
     def _has_moved_on(self, pose: Floats) -> bool:
+        """Whether the pose (4, 4) is far enough from the last keyframe for another, or there is no map."""
         move, turn = se3.magnitude(se3.relative(self._T_world_keyframe, pose))
         return self._target is None or move > STEP_M or float(np.rad2deg(turn)) > STEP_DEG
 
     def _insert(self, points: Floats, pose: Floats) -> None:
+        """Add points (N, 3), m, LiDAR frame, at a pose (4, 4) to the map as a keyframe; the oldest one leaves a full map."""
         self._clouds.append(se3.apply(pose, points))
         del self._clouds[:-MAP_KEYFRAMES]
         self._target = self._with_covariances(np.concatenate(self._clouds))
         self._T_world_keyframe = pose.copy()
 
     def _with_covariances(self, points: Floats) -> tuple[Any, Any]:
-        """Cloud with covariances, and its tree."""
+        """The package's point cloud with covariances of points (N, 3), and its search tree."""
         cloud, tree = self._package.preprocess_points(points, downsampling_resolution=LEAF_M, num_threads=self._threads)
         return cloud, tree

@@ -85,13 +85,14 @@ class StationaryDetector(Stateful):
         trial._is_stationary(scan)
 
     def _refer_to(self, scan: Scan) -> None:
-        """Planes of one scan alone."""
+        """Make the scan the reference: planes of its points alone, and the pose at which it fits them itself."""
         points = prepare_points(scan.points, self._preprocess, scan.index)
         self._planes.clear()
         self._planes.insert(points.map_points, np.eye(4))
         self._T_own = self._step(points).T_world_lidar
 
     def _step(self, points: PreparedPoints) -> RegistrationResult:
+        """One Gauss-Newton step of the points against the reference's planes, from the identity."""
         c = self._config
         once = Annealing.once(c.kernel_max)
         return solve((self._planes,), points, np.eye(4), once, c, residual=PLANES_ALONE)

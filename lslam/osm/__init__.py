@@ -1,6 +1,6 @@
 """OpenStreetMap as a prior: buildings are fetched, walls are extracted from clouds, and both are matched.
 
-A new matcher is one file with `lay` and one line here.
+A new matcher is one file with `fit_buildings` and one line here.
 """
 
 from __future__ import annotations
@@ -12,20 +12,20 @@ from typing import TYPE_CHECKING, cast
 from lslam.core.errors import UsageError, nearest
 
 if TYPE_CHECKING:
-    from lslam.osm.corrections import Lay
+    from lslam.osm.corrections import BuildingFitter
 
 
 @dataclass(frozen=True)
 class Matcher:
-    """A matcher: the module with `lay`, and whether a drift of odometry is estimated from sightings of walls before it."""
+    """A matcher: its module with `fit_buildings`, and whether a drift of odometry is estimated from walls before it."""
 
     module: str
     reveals_drift: bool = True
 
     @property
-    def lay(self) -> Lay:
-        """The function `lay` of the module, which is imported on first use."""
-        return cast("Lay", import_module(self.module).lay)
+    def fit_buildings(self) -> BuildingFitter:
+        """The function `fit_buildings` of the module, which is imported on first use."""
+        return cast("BuildingFitter", import_module(self.module).fit_buildings)
 
 
 MATCHERS = {

@@ -47,12 +47,13 @@ FARTHEST_M = 5.0  # m from the prior; a result beyond has not converged
 FAR = 1.0  # m; points farther from their nearest one do not count in the fitness score (the range of hdl_graph_slam's)
 
 
-def lay(
+def fit_buildings(
     graph: PoseGraph, solution: Solution, matches: OsmMatches, extract: BuildingExtract, inputs: BackEndInput
 ) -> BuildingFit:
-    """For each keyframe: NDT of the scan with all buildings in range, VGICP of each building, an edge to each, optimisation.
+    """Estimate buildings and poses, keyframe by keyframe: NDT of the scan with all buildings in range, VGICP with each of them.
 
-    The signature is that of `corrections.Lay`. `matches` is not used; loops and fixes that `solution` rejected are omitted.
+    Every registered building is an edge of one graph, which is optimised. The signature is that of `corrections.BuildingFitter`.
+    `matches` is not used; loops and fixes that `solution` rejected are omitted.
     """
     store, config, clocks = inputs.store, inputs.config, inputs.clocks
     osm = OsmMap(extract.buildings)
@@ -92,7 +93,7 @@ def _match(
             points = points[table_of(config.osm.labels)[labels]]
         seen = flatten_scan(points, WALL_RANGE_M)
     with clock.stage("map match"):
-        whole = lay_scan(seen, osm.walls[osm.walls_near(at[:2], config.osm.use_radius)], at)
+        whole = align_scan(seen, osm.walls[osm.walls_near(at[:2], config.osm.use_radius)], at)
     start = at if whole is None else whole.pose
     no_walls, about = (np.zeros((0, 2, 2)), np.zeros((1, 2))), (at, np.zeros(3), start, np.zeros((3, 3)))
     sight = KeyframeMatch(number, *no_walls, *about, kind="edges", reason=ONLY_START)
@@ -103,7 +104,7 @@ def _match(
         middle = osm.buildings[building].middle
         walls = osm.walls[osm.owners == building] - middle
         with clock.stage("building match"):
-            fit = lay_building(walls, seen, se2.relative(start, np.append(middle, 0.0)))
+            fit = align_building(walls, seen, se2.relative(start, np.append(middle, 0.0)))
         if fit is not None:
             spread = fitness_covariance(fit.rmse**2, config.graph)[np.ix_(PLANAR, PLANAR)]
             information = np.asarray(np.linalg.inv(spread), np.float64)
@@ -113,7 +114,7 @@ def _match(
 
 
 def _first(graph: PoseGraph, poses: Floats, count: int) -> PoseGraph:
-    """The part of the graph with the first `count` keyframes, at `poses` (K, 4, 4)."""
+    """The graph of the first `count` keyframes alone, at `poses` (K, 4, 4)."""
     return replace(
         graph,
         poses=poses[:count],
@@ -153,13 +154,16 @@ def outline_points(walls: Floats) -> Floats:
     return np.concatenate(found) if found else np.zeros((0, 2))
 
 
-def lay_scan(scan: Floats, walls: Floats, prior: Floats) -> FlatFit | None:
+def align_scan(scan: Floats, walls: Floats, prior: Floats) -> FlatFit | None:
     """Register the flattened scan (N, 2) with all `walls` (T, 2, 2) by NDT from `prior` (3,); None without convergence."""
     return _align(scan, outline_points(walls), prior, NDT_VOXEL, "ndt")
 
 
-def lay_building(walls: Floats, scan: Floats, prior: Floats) -> FlatFit | None:
-    """Register a building's `walls` (T, 2, 2), about its middle, with the flattened scan (N, 2) by VGICP; None likewise."""
+def align_building(walls: Floats, scan: Floats, prior: Floats) -> FlatFit | None:
+    """Register a building's `walls` (T, 2, 2), about its middle, with the flattened scan (N, 2) by VGICP, from `prior` (3,).
+
+    None without convergence.
+    """
     return _align(outline_points(walls), scan, prior, VGICP_VOXEL, "vgicp")
 
 
@@ -190,5 +194,5 @@ def _align(
 
 
 def _upright(flat: Floats, heights: Sequence[float]) -> Floats:
-    """Every point at each of the heights: (N * H, 3)."""
+    """Points (N * H, 3): each of `flat` (N, 2) at each of the `heights`, m. Registration in three dimensions needs them."""
     return np.concatenate([np.column_stack([flat, np.full(len(flat), z)]) for z in heights])

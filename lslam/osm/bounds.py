@@ -133,5 +133,6 @@ def positions_along(what: str, data_root: Path | None = None, origin: NDArray[An
 
 
 def _names_latitude(path: Path) -> bool:
+    """Whether the first line of a file contains `lat`: a header of fixes."""
     with path.open(errors="replace") as stream:
         return "lat" in stream.readline().lower()

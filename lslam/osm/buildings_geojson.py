@@ -134,19 +134,23 @@ def _correction(feature: dict[str, Any], origin: Floats) -> BuildingCorrection:
 
 
 def _undone(there: Building, displacement: Floats) -> Building:
-    """The building as on the map; what it was turned about is the middle of the box round it there."""
+    """The building before its `displacement` (3,), from the displaced one, `there`.
+
+    The rotation was about the middle of the box round the building on the map.
+    """
     R = se2.rotation(float(displacement[2]))
     upright = there.transform(R.T, np.zeros(2))
     return upright.transform(np.eye(2), R @ upright.middle - displacement[:2] - upright.middle)
 
 
 def _positions(points: Floats, origin: Floats) -> list[list[float]]:
-    """(K, 2) m as lon, lat in deg."""
+    """GeoJSON positions, lon, lat in deg, of points (K, 2), m, in the local frame of `origin` (3,)."""
     places = from_local(np.column_stack([points, np.zeros(len(points))]), origin)
     return [[round(lon, DECIMALS), round(lat, DECIMALS)] for lat, lon, _ in places.tolist()]
 
 
 def _metres(ring: Any, origin: Floats) -> Floats:
+    """Corners (K, 2), m, of a GeoJSON ring, in the local frame of `origin` (3,)."""
     places = np.array(ring, np.float64).reshape(-1, 2)
     return np.asarray(to_local(np.column_stack([places[:, ::-1], np.zeros(len(places))]), origin)[:, :2])
 
@@ -183,7 +187,10 @@ def corrected_osm(data: OsmData, corrected_map: CorrectedMap) -> OsmData:
 
 @dataclass(frozen=True)
 class _NodeTarget:
-    """Where, m, one building wants one of its nodes, where that is on the map, its ways through it, how well it knows."""
+    """Target position, m, of a node for one of its buildings.
+
+    It has the position on the map, the building's ways through the node, and the building's confidence.
+    """
 
     node: int
     ways: tuple[int, ...]
@@ -235,6 +242,7 @@ def _agreeing(wishes: list[_NodeTarget]) -> list[list[_NodeTarget]]:
 
 
 def _element(building: Building) -> tuple[str, int]:
+    """Kind and number of a building's element."""
     kind, number = building.osm_id.split("/")
     return kind, int(number)
 

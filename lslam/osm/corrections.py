@@ -1,6 +1,6 @@
 """The second level: with the trajectory fixed, the displacement of every building is estimated from sightings of its walls.
 
-The interface of matchers, `Lay`, and the matcher of walls are here as well.
+The interface of matchers, `BuildingFitter`, and the matcher of walls are here as well.
 """
 
 from __future__ import annotations
@@ -189,6 +189,7 @@ def _samples(walls: Floats) -> Floats:
 
 
 def _ground(building: Building) -> Any:
+    """The area, of shapely, that a building covers."""
     from shapely import union_all
 
     return union_all([footprint_polygon(f).buffer(0) for f in building.footprints])
@@ -274,7 +275,7 @@ def map_prior(matches: OsmMatches, config: OsmConfig) -> MapPrior:
 
 
 def _unseen(config: OsmConfig) -> MapPrior:
-    """The prior before any scan."""
+    """The map's prior for buildings that no scan saw: no shift, the configured sigmas."""
     shift_sigma = np.maximum(np.full(2, config.shift_sigma), TOGETHER[:2])
     return MapPrior(np.zeros(2), shift_sigma, planar_sigmas(config.building_sigma))
 
@@ -289,6 +290,7 @@ def write_buildings(folder: Path, corrected_map: CorrectedMap, data: OsmData) ->
 
 
 def _status(count: int, is_absent: bool) -> BuildingStatus:
+    """Status of a building with `count` matches: seen, absent or unseen."""
     if count:
         return "seen"
     return "absent" if is_absent else "unseen"
@@ -314,8 +316,8 @@ class BuildingFit:
     joint: JointSolution | None = None
 
 
-class Lay(Protocol):
-    """`lay` of a matcher's module."""
+class BuildingFitter(Protocol):
+    """Function `fit_buildings` of a matcher's module."""
 
     def __call__(
         self, graph: PoseGraph, solution: Solution, matches: OsmMatches, extract: BuildingExtract, inputs: BackEndInput
@@ -328,10 +330,13 @@ class Lay(Protocol):
         """
 
 
-def lay(
+def fit_buildings(
     graph: PoseGraph, solution: Solution, matches: OsmMatches, extract: BuildingExtract, inputs: BackEndInput
 ) -> BuildingFit:
-    """As `Lay`, by walls: with the trajectory in one graph in mode `non-rigid`, with a fixed trajectory in the others."""
+    """Estimate the displacements of the buildings by their walls, see `BuildingFitter`.
+
+    In mode `non-rigid` one graph has buildings and trajectory; in the other modes the trajectory is fixed.
+    """
     with inputs.clocks[len(inputs.store) - 1].stage("graph"):
         if inputs.config.osm.mode == "non-rigid":
             joint, buildings = join_buildings(graph, solution, matches, inputs.config)

@@ -86,7 +86,7 @@ def hold_by_buildings(osm: OsmSource, graph: PoseGraph, placement: Placement, in
         return None
     matches = finish(locations, extract, out.keyframes, out.solution, config.osm, inputs.clocks)
     try:
-        laid = find_matcher(config.osm.matcher).lay(held, out.solution, matches, extract, inputs)
+        laid = find_matcher(config.osm.matcher).fit_buildings(held, out.solution, matches, extract, inputs)
     except (GraphError, np.linalg.LinAlgError) as error:
         problems.append(f"OSM: {error}; the run goes on with its buildings where the map has them")
         return replace(out, osm=matches)
@@ -160,7 +160,7 @@ def on_map(graph: PoseGraph, locations: MapLocations, config: Config) -> PoseGra
 
 
 def _priors(locations: MapLocations, config: Config) -> list[PlanarPrior]:
-    """The planar priors by the matches.
+    """The planar priors on keyframes by the accepted matches.
 
     The error of a wall on the map is common to all keyframes that see it (`shares`). In the modes with an exact map only
     sightings have errors, which are independent between submaps.
@@ -181,7 +181,7 @@ def _wall_sigmas(config: OsmConfig) -> tuple[float, float]:
 
 
 def sightings(locations: MapLocations, poses: Floats, config: Config) -> WallSightings:
-    """The sightings of all buildings' walls, with the keyframes at `poses` (K, 4, 4)."""
+    """The sightings of the map's walls, with the keyframes at `poses` (K, 4, 4), as drift estimation takes them."""
     osm, planar = locations.osm, se2.of_se3(poses)
     rows: list[tuple[Floats, Floats]] = [(np.zeros((0, 2, 2)), np.zeros((0, 2), np.int64))]
     for match in checking(locations.matches):

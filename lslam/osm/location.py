@@ -127,7 +127,7 @@ def finish(
     config: OsmConfig,
     clocks: KeyframeClocks | None = None,
 ) -> OsmMatches:
-    """All keyframe matches with the graph's verdicts, and the building matches from the final `poses`.
+    """All keyframe matches with the verdicts of the `solution`, and building matches at the final `poses` (K, 4, 4).
 
     clocks : measure the time of each keyframe, stage `building match`
     """
@@ -226,7 +226,7 @@ def _place(
     numbers = [match.keyframe for match in matches]
     place = se2.compose(first.pose, se2.inverse(poses[first.keyframe]))
     laid, ways = se2.compose(place, poses[numbers]), np.array([run.store.keyframes[k].distance for k in numbers])
-    turn, squared = track.lay(laid, ways, matches, sigma)
+    turn, squared = track.align(laid, ways, matches, sigma)
     right = [
         i
         for i, (match, far) in enumerate(zip(matches, squared, strict=True))
@@ -272,7 +272,7 @@ class FirstPose:
 
 
 def known_start(config: OsmConfig) -> FirstPose:
-    """The start by the origin and heading of the configuration, with their sigmas."""
+    """The first pose by the configured origin and heading, with their sigmas."""
     radius, turn = config.start_radius / SEARCH_SIGMAS, np.radians(config.start_heading_deg) / SEARCH_SIGMAS
     return FirstPose(first_pose(config), np.array([radius, radius, turn]))
 
@@ -291,11 +291,14 @@ class LevelRun:
         return se2.of_se3(self.poses)
 
     def planar_pose(self, number: int) -> Floats:
-        """(3,) one of them."""
+        """Planar pose (3,), x, y (m), yaw (rad), of keyframe `number` in the level world."""
         return se2.of_se3(self.poses[number])
 
     def see_walls(self, number: int, size: int) -> tuple[Floats, Floats]:
-        """Walls (S, 2, 2) in the submap of `size` keyframes about one, and positions (V, 2) of the sensor, in its level frame."""
+        """Walls (S, 2, 2), m, in the submap of `size` keyframes about keyframe `number`, and positions (V, 2) of the sensor.
+
+        Both in the level frame of that keyframe.
+        """
         store, config, at = self.store, self.config.osm, self.planar_pose(number)
         T_world_level = se2.to_se3(at)
         T_world_level[2, 3] = self.poses[number, 2, 3]

@@ -176,12 +176,14 @@ def _direction(wall: Floats) -> tuple[Floats, float]:
 
 
 def _transform(shape: Any, rotation: Floats, shift: Floats) -> Any:
+    """A shapely geometry rotated by (2, 2) and shifted by (2,), m."""
     from shapely.affinity import affine_transform
 
     return affine_transform(shape, [*rotation.ravel(), *shift])
 
 
 def _on_map(contact: tuple[int, int, int], one: Solid, other: Solid) -> Contact:
+    """The contact of a move's (side, corner, wall), with the corner and the wall as on the map."""
     side, corner, wall = contact
     owner, holder = (one, other) if side == 0 else (other, one)
     return Contact(owner.number, owner.walls[corner, 0], holder.number, holder.walls[wall])
@@ -256,6 +258,7 @@ def _pairs(solids: Sequence[Solid], rows: Longs) -> list[tuple[int, int]]:
 
 
 def _is_building_part(one: Solid, other: Solid) -> bool:
+    """Whether two buildings overlap on the map by so much that one is a part of the other."""
     shared = one.shape.intersection(other.shape).area
     return bool(shared > NESTED_SHARE * min(one.shape.area, other.shape.area))
 

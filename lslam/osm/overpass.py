@@ -42,20 +42,20 @@ class OverpassReply:
 
     @classmethod
     def of(cls, tree: OverpassReply | Mapping[str, Any]) -> OverpassReply:
-        """The reply of a parsed one, or itself."""
+        """A reply object from a parsed reply; a reply object is returned unchanged."""
         return tree if isinstance(tree, cls) else cls(json.dumps(tree, ensure_ascii=False).encode("utf-8", "replace"))
 
     def items_of(self) -> JsonItems:
-        """Its elements, one at a time. Going through them raises ValueError as `JsonItems`."""
+        """Iterator over its elements, one at a time; iterating raises ValueError as `JsonItems`."""
         return JsonItems(io.BytesIO(self.text), ELEMENTS)
 
     def write(self, stream: IO[bytes], facts: Mapping[str, Any]) -> None:
-        """The text of a reply that was checked, with `facts` before what it says."""
+        """Write the text of a checked reply, with `facts` inserted at the beginning of its object."""
         stream.write(json.dumps(facts).encode().removesuffix(b"}") + b", ")
         stream.write(memoryview(self.text)[self.text.index(b"{") + 1 :])
 
     def facts(self) -> dict[str, Any]:
-        """All that is not elements."""
+        """Everything in the reply but its elements."""
         found = self.items_of()
         for _ in found:
             pass
@@ -169,6 +169,7 @@ def _file_name(bounds: Bounds) -> str:
 
 
 def _bounds_of(path: Path) -> Bounds | None:
+    """Box in the file name of a cached reply; None for other files."""
     with contextlib.suppress(ValueError, TypeError, UsageError):
         bounds = Bounds(*(float(v) for v in path.name.rsplit("-", 1)[0].split(",")))
         return bounds if _file_name(bounds) == path.name else None
@@ -285,6 +286,7 @@ def _read(reply: Any, server: str, timeout: float, is_late: threading.Event) -> 
 
 def _too_late(server: str, limit: float) -> str:
     # No second attempt: a server that is merely busy answers so.
+    """Message that the server did not answer in time."""
     return f"{server} did not answer within {limit:g} s: try later, or name another osm.server"
 
 
@@ -303,9 +305,9 @@ def _parse(body: bytes, bounds: Bounds, server: str) -> OverpassReply:
 
 
 def _check_place(reply: OverpassReply, bounds: Bounds, is_own: bool = True) -> OverpassReply:
-    """The reply. Raises ValueError when it is invalid, or when `is_own` and most of its nodes lie far outside `bounds`.
+    """Check a reply and return it. Raises ValueError if it is invalid, or of another place.
 
-    is_own : whether the request was for exactly `bounds`
+    is_own : whether the request was for exactly `bounds`; then most of the nodes must lie near them
     """
     data = from_overpass(reply)
     places = np.array([*data.nodes.values()]).reshape(-1, 2)

@@ -71,6 +71,7 @@ class _RequestedCircle:
     radius: float
 
     def is_at(self, place: Floats, radius: float) -> bool:
+        """Whether `place` (2,), m, is within `radius`, m, of the circle's centre."""
         return float(np.linalg.norm(place - self.centre)) <= radius
 
 
@@ -166,6 +167,7 @@ class OsmBuffer:
         self.close()
 
     def _work(self) -> None:
+        """Fetch the requested circles, until None is queued (in the thread)."""
         while (request := self._queue.get()) is not None:
             self._done.put(self._circle(request))
 
@@ -184,18 +186,18 @@ class OsmBuffer:
             return _Circle(request, NOTHING, f"the reply cannot be used ({type(error).__name__}: {error})")
 
     def _check(self, reply: OverpassReply) -> None:
-        """Raise the errors of an invalid reply."""
+        """Raise an error where buildings cannot be read from a reply."""
         buildings_of(from_overpass(reply), self._origin, "the reply")
 
     def _keep(self, circle: _Circle, folder: Path) -> None:
-        """Write a reply that is used; replies after the last wait are not written."""
+        """Write the reply of a circle to `folder`, unless the buildings were handed out already."""
         folder.mkdir(parents=True, exist_ok=True)
         requested = {"lslam_centre": circle.request.centre.tolist(), "lslam_radius": circle.request.radius}
         with atomic_write(folder / f"{len(self.replies):06d}.json") as stream:
             circle.reply.write(stream, requested)
 
     def _load(self, folder: Path | None) -> None:
-        """Remember `folder` for later replies, and read an earlier run's there; InputError for a damaged one."""
+        """Set `folder` for later replies, and take those of an earlier run there; InputError for a damaged one."""
         self._folder = folder
         for path in [] if folder is None else sorted(folder.glob("*.json")):
             try:
@@ -208,6 +210,7 @@ class OsmBuffer:
                 raise InputError(f"{path} is no reply kept by an earlier run ({error}): remove it") from None
 
     def _collect(self) -> None:
+        """Take all finished requests."""
         while not self._done.empty():
             self._take(self._done.get())
 
@@ -224,6 +227,7 @@ class OsmBuffer:
         self._use(circle)
 
     def _use(self, circle: _Circle) -> None:
+        """Add the reply of a circle to `replies`."""
         self._answered.append(circle.request)
         self.replies.append(circle.reply)
 
@@ -267,7 +271,10 @@ class OsmServer(OsmBuffer):
             self.ask(np.zeros(2), self._config.fetch_radius * 2.0**doubled)
 
     def extract(self, origin: Floats) -> BuildingExtract:
-        """Buildings received, frame at `origin` (3,), after a wait for the first reply and a short one more; else InputError."""
+        """The buildings received so far, in the frame at `origin` (3,). Raises InputError without a reply.
+
+        Waits for the first reply, and for a short time for the others.
+        """
         self.wait(FIRST_REPLY_S, requests=1)
         self.wait(LATER_REPLY_S)
         self.close()
@@ -304,7 +311,7 @@ class OsmFile:
         """Nothing is fetched: all buildings are read."""
 
     def extract(self, origin: Floats) -> BuildingExtract:
-        """Its buildings in the local frame at `origin` (3,)."""
+        """The buildings of the file in the local frame at `origin` (3,)."""
         return some_buildings_of(self.data, origin, self._path)
 
 

@@ -48,7 +48,7 @@ class OsmTrack:
         self.pose = moved
 
     def begin(self, pose: Floats, information: Floats) -> None:
-        """Reset to a match of full rank."""
+        """Reset the track to the pose (3,) and information (3, 3) of a match of full rank."""
         self.pose = np.asarray(pose, np.float64)
         self.covariance = np.asarray(np.linalg.inv(information) + np.diag(self._map))
 
@@ -67,11 +67,13 @@ class OsmTrack:
         kept: Floats = np.eye(3) - gain @ H
         self.covariance = kept @ self.covariance @ kept.T + gain @ R @ gain.T
 
-    def lay(self, poses: Floats, ways: Floats, matches: Sequence[KeyframeMatch], sigma: Floats) -> tuple[float, Floats]:
+    def align(
+        self, poses: Floats, ways: Floats, matches: Sequence[KeyframeMatch], sigma: Floats
+    ) -> tuple[float, Floats]:
         """Align `poses` (M, 3) as a whole with their `matches`, one each.
 
-        The displacement has the prior `sigma` (3,). The weight of a match decreases with the distance travelled, `ways` (M,),
-        m, from the first one.
+        The displacement has the prior `sigma` (3,), m, m, rad. The weight of a match decreases with the distance travelled,
+        `ways` (M,), m, from the first one.
 
         Returns the rotation, rad, about the first pose, and the squared Mahalanobis distances (M,) of the matches.
         """

@@ -166,6 +166,7 @@ class DriftFit:
         return self._known[variance]
 
     def _root(self, rates: Floats) -> Floats:
+        """Square root of the prior covariance of all parameters: of start and shift, and `rates` (P, P) of the rates."""
         n = len(self._given)
         whole = np.zeros((n + len(rates), n + len(rates)))
         whole[:n, :n], whole[n:, n:] = np.diag(self._given), rates
@@ -313,5 +314,5 @@ def _effects(graph: PoseGraph, at_knots: Floats) -> Floats:
 
 
 def _across(away: Floats) -> Floats:
-    """Displacement of a point at `away` (..., 2), m, by a small rotation, per rad."""
+    """Derivative (..., 2), m per rad, of a point at `away` (..., 2), m, by a small rotation about the origin."""
     return np.stack([-away[..., 1], away[..., 0]], axis=-1)

@@ -81,7 +81,7 @@ class WallMatch:
         return "edges" if self.rank == 3 else "lines"
 
     def facts(self) -> dict[str, Any]:
-        """The fields that it has in common with the matches of keyframes and of buildings, and why it is rejected."""
+        """The fields for a keyframe's or building's match, by name, with the reason if it is rejected."""
         names = ("pose", "information", "rank", "kind", "fitness", "coverage", "rms", "pairs")
         reason = "another place fits nearly as well" if self.is_ambiguous else ""
         return {name: getattr(self, name) for name in names} | {"reason": reason}
@@ -127,6 +127,7 @@ def find_heading(
 
 
 def _rows(segments: NDArray[Any]) -> Floats:
+    """Segments (N, 2, 2) as rows (N, 4), x y x y."""
     return np.ascontiguousarray(np.asarray(segments, np.float64).reshape(-1, 4))
 
 
@@ -197,13 +198,17 @@ class _WallSearch:
         return np.asarray(poses[np.argsort(away, kind="stable")[:MOST_REFINEMENTS]])
 
     def _beside(self, best: WallMatch) -> Floats:
-        """Poses (K, 3) across the parallel walls of `best`, over the whole window; parallel walls have no corners that vote."""
+        """Starts (K, 3) beside the match `best`, shifted across its parallel walls over the whole window.
+
+        Parallel walls have no corners that vote.
+        """
         across = np.linalg.eigh(best.information[:2, :2])[1][:, 1]
         reach = float(np.linalg.norm(across * self.window[:2]))
         steps = np.arange(0.5 * BESIDE, reach, BESIDE)
         return np.asarray(self.at + np.append(across, 0.0) * np.concatenate([-steps, steps])[:, None])
 
     def _refine_all(self, starts: list[tuple[Floats, Floats]]) -> list[WallMatch]:
+        """Matches refined from all starts (pose and gates) that lead to one."""
         return [match for start in starts if (match := self._refine(*start)) is not None]
 
     def _refine(self, pose: Floats, gates: Floats) -> WallMatch | None:
@@ -234,6 +239,7 @@ class _WallSearch:
         return WallMatch(pose, information, rank, float(fitness), float(coverage), float(distance), float(rms), pairs)
 
     def _fit(self, pose: Floats, farthest: float) -> tuple[float, float, Longs]:
+        """Mean distance, m, covered share and pairs (S,) at a pose (3,), as of `wall_matching.fit`."""
         return wall_matching.fit(self.source, self.target, pose, farthest, LIKENESS, self.by_coverage)
 
 
@@ -252,7 +258,7 @@ def _deflate(normal: Floats) -> tuple[Floats, Floats, int]:
 
 
 def _at_pose(planar: Floats, centre: Floats, pose: Floats) -> Floats:
-    """Information (3, 3) of the pose from that of the walls' centre, which moves with its translation and rotation."""
+    """Information (3, 3) of the `pose` (3,) from that of the walls' `centre` (2,), which moves with the pose."""
     moves = np.eye(3)
     moves[0, 2], moves[1, 2] = -(centre[1] - pose[1]), centre[0] - pose[0]
     return np.asarray(moves.T @ planar @ moves)

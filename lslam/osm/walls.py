@@ -122,7 +122,7 @@ TURN_DEG_PER_M = 2.0
 
 
 def planar_sigmas(sigma_m: float) -> Floats:
-    """(3,) x and y, m, and heading, rad: one sigma of what is off by `sigma_m` on the map."""
+    """Prior sigmas (3,), x and y, m, and heading, rad, of a pose or building with an error of `sigma_m` on the map."""
     return np.array([sigma_m, sigma_m, np.radians(TURN_DEG_PER_M * sigma_m)])
 
 
@@ -160,7 +160,10 @@ def _high(cloud: NDArray[np.float32], height: float) -> Longs:
 
 
 def _direct(lines: Floats, views: Floats) -> Floats:
-    """The segments, directed with the side of most views to the right; a view weighs by distance from the line / range^3."""
+    """The segments (S, 4), each directed so that most views lie to its right.
+
+    A view counts by its distance from the line, divided by its range cubed.
+    """
     to_view = views[None] - lines.mean(axis=1)[:, None]
     along = (lines[:, 1] - lines[:, 0])[:, None]
     left = along[..., 0] * to_view[..., 1] - along[..., 1] * to_view[..., 0]
@@ -216,6 +219,7 @@ class OsmMap:
         return np.flatnonzero(np.isin(self.owners, self.near(place, reach)))
 
     def _away(self, place: Floats) -> Floats:
+        """(B,) distance, m, from `place` (2,) to the box round each building."""
         outside = np.maximum(np.maximum(self._low - place, place - self._high), 0.0)
         return np.asarray(np.linalg.norm(outside, axis=1))
 
@@ -261,7 +265,10 @@ def _heights(cloud: NDArray[np.float32]) -> Floats:
 
 
 def _standing(points: Floats, height: Floats) -> NDArray[np.uint16]:
-    """SemanticKITTI classes (N,) of points (N, 3) by their `height` (N,), m: shape of voxels, then of connected objects."""
+    """SemanticKITTI classes (N,) of points (N, 3) above the ground, by the shape of voxels, then of connected objects.
+
+    height : (N,) m above the ground
+    """
     cells = np.floor(points / CUBE_M).astype(np.int64)
     keys, member = np.unique(_pack_cells(cells), return_inverse=True)
     is_flat, is_upright, is_rough = _shapes(points, keys, member)
@@ -309,7 +316,7 @@ def _shapes(points: Floats, keys: Longs, member: Longs) -> tuple[Bools, Bools, B
 
 
 def _things(cells: Longs) -> Longs:
-    """Index of the connected object that each point belongs to, seen from above; `cells` (N, 3) are the points' voxels."""
+    """Index (N,) of the connected object, seen from above, that each point belongs to; cells : (N, 3) voxels of the points."""
     from scipy import ndimage
 
     if not len(cells):
@@ -346,10 +353,12 @@ def _by_size(
 
 
 def _within(values: Floats, limits: tuple[float, float]) -> Bools:
+    """Mask of the values strictly between two limits."""
     return (values > limits[0]) & (values < limits[1])
 
 
 def _extent(things: Longs, values: Floats, count: int) -> Floats:
+    """Range (count,) of the values of each object's points; things : (N,) object of each point."""
     low, high = np.full(count, np.inf), np.full(count, -np.inf)
     np.minimum.at(low, things, values)
     np.maximum.at(high, things, values)

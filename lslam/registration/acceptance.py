@@ -84,7 +84,7 @@ class Acceptance:
 
 
 def failure(T_prior: Floats, source_points: int, reason: str) -> RegistrationResult:
-    """The motion prior with its covariance."""
+    """A failed registration at the motion prior, with the prior's large covariance and the `reason`."""
     return RegistrationResult(
         T_prior.copy(),
         ok=False,
@@ -96,7 +96,7 @@ def failure(T_prior: Floats, source_points: int, reason: str) -> RegistrationRes
 
 
 def correction(T_prior: Floats, pose: Floats) -> tuple[float, float]:
-    """How far (m, rad) the pose is from what was expected."""
+    """Distance, m, and angle, rad, between two poses (4, 4): the prior and the registered one."""
     move, R = pose[:3, 3] - T_prior[:3, 3], (T_prior[:3, :3].T @ pose[:3, :3]).tolist()
     sine = math.hypot(R[2][1] - R[1][2], R[0][2] - R[2][0], R[1][0] - R[0][1])
     return math.sqrt(float(move @ move)), math.atan2(sine, R[0][0] + R[1][1] + R[2][2] - 1.0)

@@ -94,7 +94,10 @@ def voxel_terms(
 
 
 def part_of_usual(size: float, usual: float) -> float:
-    """Weight of planes in voxels that are larger than usual, m: what bends within them makes their points err together."""
+    """Weight, at most 1, of planes in voxels of edge `size`, m, that are larger than `usual`, m.
+
+    A surface bends within a large voxel, so that its points err together.
+    """
     return min(usual / size, 1.0)
 
 
@@ -116,9 +119,9 @@ class MapAlignment:
         directions: Floats = EVERYWHERE,
         information: Floats | None = None,
     ) -> Problem:
-        """To align with the fine map from `start` (4, 4), the kernel closing from `width`, m, or as the user wants it.
+        """The problem of aligning the points with the fine map from `start` (4, 4), the kernel narrowing from `width`, m.
 
-        coarser : maps for the points that find nothing in the fine one, finest first; none: all that there are
+        coarser : maps for the points without a match in the fine one, finest first; none: all coarser levels
         directions : (6, 6) projector on the directions that are aligned, world axes; no rows: all
         information : (6, 6) of the start as a prior, world axes, 1/m2 and 1/rad2; None: it is only a start
         """
@@ -137,18 +140,19 @@ class MapAlignment:
         return Problem(terms, start, Annealing(width, steps, end), limits, matches, farthest, c.inlier_ratio)
 
     def _recall(self, count: int) -> Correspondences:
-        """What was looked up for as many points in the map as it is: a scan is deskewed twice, and moves little between."""
+        """Correspondences of the last `count` points, for reuse while the map is unchanged; else empty ones.
+
+        A scan is aligned twice, deskewed anew, and its points move little between.
+        """
         if self._changes != self.map.changes or len(self._matches) != count:
             self._matches, self._changes = Correspondences(count), self.map.changes
         return self._matches
 
     def coarse_to_fine(self, points: PreparedPoints, T_prior: Floats, width: float = np.inf) -> RegistrationResult:
-        """Coarse planes, annealed slowly, catch what fine voxels lose: metres per scan instead of decimetres.
+        """Align with coarse planes and from there with the fine map: from a start metres off instead of decimetres.
 
-        Planes whatever the residual: all others also hold a point to where the rings of earlier scans lie, and on flat
-        ground these agree with any speed that the map was once made with.
-        Few scans of a sparse sensor put single rings into fine voxels, which are no planes yet: the points there keep
-        their coarse plane, the others take a fine one.
+        Planes whatever the residual: other residuals pull points to the rings of earlier scans, and on flat ground these agree
+        with any speed that the map was once made with. Points whose fine voxel has no plane yet keep their coarse one.
         width : m, of the kernel at the start, where the prior is known better than `COARSE_KERNEL_M`
         """
         c = self.config
@@ -159,7 +163,7 @@ class MapAlignment:
         return replace(fine, iterations=coarse.iterations + fine.iterations)
 
     def coarse_maps(self, points: PreparedPoints, T_prior: Floats) -> tuple[GaussianMap, ...]:
-        """The coarser levels of the map, from the one on whose voxels are so large that planes lie under enough points.
+        """The coarser levels of the map, finest first, beginning where enough points have a plane at `T_prior` (4, 4).
 
         From thirty metres above the ground the rings of one scan lie metres apart.
         """

@@ -49,7 +49,7 @@ class Target(Stateful, ABC):
         """The reason why a scan cannot be registered; empty where it can."""
 
     def ready(self, points: Any) -> Any:
-        """The points with all that the residual takes of them; as they are where that is nothing more."""
+        """The points with all that the residual needs of them (covariances, ring gaps), unchanged if that is nothing more."""
         return points
 
     @abstractmethod
@@ -89,7 +89,7 @@ class Attempt:
 
     @property
     def annealing(self) -> Annealing:
-        """The kernel's schedule: it begins at the recent error of the motion prior, or at `RECOVER_M` with `is_near`."""
+        """Kernel widths and steps: the first width is the recent error of the motion prior, or `RECOVER_M` with `is_near`."""
         c, h = self.config, self.history
         width = RECOVER_M if self.is_near else h.threshold.width
         steps = c.max_iterations * self.target.times_steps
@@ -111,7 +111,7 @@ class Attempt:
         return limits.judge(result, self.T_prior if T_prior is None else T_prior)
 
     def credit(self, result: RegistrationResult, pose_source: str) -> RegistrationResult:
-        """The result of the policy `pose_source`, with its correction of the prior."""
+        """The result labelled with the policy `pose_source` that produced it, and with its correction of the prior."""
         return replace(result, prior_error=correction(self.T_prior, result.T_world_lidar), pose_source=pose_source)
 
     @property
@@ -120,7 +120,7 @@ class Attempt:
         return self.config.start_reach > 0 and self.history.is_young
 
     def is_small(self, result: RegistrationResult) -> bool:
-        """Whether the correction of the motion prior is within the prediction error that is expected of it."""
+        """Whether the result corrects the motion prior by less than `RECOVER_M` and `RECOVER_DEG`."""
         move, turn = result.prior_error
         return move < RECOVER_M and turn < np.deg2rad(RECOVER_DEG)
 

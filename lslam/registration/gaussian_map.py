@@ -91,14 +91,14 @@ class GaussianMap(Stateful):
         return gaussians.insert(points, R, t, *rules, self.reach, *self._arrays)
 
     def clear(self) -> None:
-        """Forget everything; the room is kept."""
+        """Remove all voxels; the arrays keep their size."""
         self.keys[:] = gaussians.FREE
         self.table[:] = -1
         self.pool[:] = 0
         self._shapes[:, 10] = 0.0
 
     def shapes(self) -> Floats:
-        """(C, 14) full Gaussians of the voxels, for `ndt`: computed when asked for, where voxels have grown."""
+        """(C, 14) full Gaussians of the voxels, as of `ndt_residual.describe`; brought up to date here."""
         from lslam.registration.kernels.ndt_residual import describe
 
         if len(self._shapes) < len(self.keys):
@@ -159,7 +159,7 @@ class GaussianMap(Stateful):
         return self.moments, self.planes, self.keys, self.refreshed, self.table, self.pool, self.free
 
     def state(self) -> State:
-        """The voxels: all of the pool that was ever used."""
+        """Voxels and free list as arrays, for a checkpoint."""
         used, freed = int(self.pool[gaussians.USED]), int(self.pool[gaussians.FREED])
         return {
             "capacity": len(self.keys),
@@ -173,7 +173,7 @@ class GaussianMap(Stateful):
         }
 
     def restore(self, state: State) -> None:
-        """Go on with the voxels of `state`; raises InputError when they do not fit together."""
+        """Replace all voxels by those of `state`; raises InputError when its arrays do not fit together."""
         capacity, numbers = int(state["capacity"]), np.asarray(state["pool"], np.int64)
         used, freed, hand, live = (int(v) for v in numbers)
         if not (0 <= freed <= used <= capacity <= 1 << 26 and 0 <= hand <= used and live == used - freed):
@@ -195,6 +195,7 @@ class GaussianMap(Stateful):
         self._rehash()
 
     def _grow(self) -> None:
+        """Double the room for voxels."""
         capacity = 2 * len(self.keys)
         for name in ("moments", "planes", "keys", "refreshed", "free"):
             old = getattr(self, name)
@@ -204,6 +205,7 @@ class GaussianMap(Stateful):
         self._rehash()
 
     def _rehash(self) -> None:
+        """Build the hash table anew for the present room."""
         self.table = np.full(4 * len(self.keys), -1, np.int32)
         gaussians.rehash(self.keys, self.table, int(self.pool[gaussians.USED]))
 
@@ -228,7 +230,7 @@ def source_covariance(
 
 
 def _of_neighbours(source: Floats, map_points: NDArray[np.float32], thin: float) -> Floats:
-    """As generalized ICP has it: the normal of the nearest points, whether these are of several rings or of one."""
+    """Discs (S, 6), m2, whose normals are those of the nearest points, of one ring or several, as in generalized ICP."""
     from scipy.spatial import cKDTree
 
     cloud = map_points.astype(np.float64)
@@ -240,9 +242,10 @@ def _of_neighbours(source: Floats, map_points: NDArray[np.float32], thin: float)
 
 
 def _of_voxels(source: Floats, map_points: NDArray[np.float32], thin: float) -> Floats:
-    """The normal is that of the scan's own points in the cell around. A ring by itself has none: a disc across it would be
-    a guess that holds the sensor to where the ring was. Such points get no normal but their noise, `thin` in all
-    directions, and the map's normal alone decides.
+    """Discs (S, 6), m2, whose normals are those of the scan's points in the voxel around.
+
+    A single ring has no normal: a disc across it would hold the sensor to where the ring was. Its points get the variance
+    `thin` in all directions, and the map's normal alone decides.
     """
     scan = GaussianMap(COVARIANCE_CELL_M, capacity=1 << int(np.ceil(np.log2(max(len(map_points), 256)))), reach=np.inf)
     scan.insert(map_points, np.eye(4))

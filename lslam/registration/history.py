@@ -81,14 +81,14 @@ class UsualAgreement(Stateful):
         return share < self.least
 
     def observe(self, share: float) -> None:
-        """Learn from a good scan: at once what is more than usual, by and by what is less.
+        """Update the usual share by a good scan: at once by a larger share, gradually by a smaller one.
 
         Each scan fills the voxels of a young map, and the next one finds more of them: a mean over the last few lags behind.
         """
         self.usual = max(share, FORGETTING_FACTOR * self.usual + (1 - FORGETTING_FACTOR) * share)
 
     def relax(self) -> None:
-        """Expect less after a bad scan, as if nothing had agreed: a place that has changed for good is accepted after a few."""
+        """Lower the usual share after a bad scan, so that a place that has changed for good is accepted after a few."""
         self.usual *= FORGETTING_FACTOR
 
 
@@ -123,7 +123,10 @@ class History(Stateful):
         return self.inserted <= self.start_scans
 
     def enter(self, points: NDArray[Any], T_world_lidar: Floats, lever_arm: float = 1.0) -> None:
-        """One more scan is in the map; `lever_arm` of its rotation, m."""
+        """Count a scan that entered the map, points (N, 3), LiDAR frame, at its pose (4, 4), as a recent one and for rest.
+
+        lever_arm : m, at which its rotation counts
+        """
         self.inserted += 1
         self.rest.enter(points, T_world_lidar, lever_arm)
         self.recent = (*self.recent, (points, T_world_lidar))[-self.start_scans :]

@@ -61,10 +61,11 @@ class KeyframeSubmap(MapScans):
         self.chosen = chosen
 
     def _positions(self) -> Floats:
+        """(K, 3) m, world, of all keyframes."""
         return np.stack([pose[:3, 3] for pose in self.poses])
 
     def _is_due(self, T: Floats) -> bool:
-        """Far from every keyframe, or turned away from the only one near by."""
+        """Whether a pose T (4, 4) is far from every keyframe, or turned away from the only one near by."""
         if not self.poses:
             return True
         spacing = spacing_of(self.spaciousness)

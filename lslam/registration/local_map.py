@@ -30,7 +30,7 @@ WIDE_FACTORS = (2, 4)
 
 
 def surroundings_m(config: RegistrationConfig) -> float:
-    """How far from a spot scans share no voxel with it but the widest: their rings hit other ground."""
+    """Distance, m, beyond which scans share only the widest voxels with those from a spot: their rings hit other ground."""
     return config.voxel_size * COARSE_FACTOR * WIDE_FACTORS[0]
 
 
@@ -84,17 +84,17 @@ class LocalMap(Stateful):
             level.insert(few, T_world_lidar)
 
     def clear(self) -> None:
-        """Forget everything; the room is kept."""
+        """Remove all voxels; the arrays keep their size."""
         self.changes += 1
         for level in self.levels:
             level.clear()
 
     def state(self) -> State:
-        """What `restore` needs to go on from here."""
+        """The voxels of all levels, for a checkpoint."""
         return {"levels": [level.state() for level in self.levels]}
 
     def restore(self, state: State) -> None:
-        """Go on where `state` was taken."""
+        """Replace all voxels by those of `state`."""
         self.changes += 1
         for level, level_state in zip(self.levels, state["levels"], strict=True):
             level.restore(level_state)
@@ -112,7 +112,7 @@ class AllScans(MapScans):
     """Every scan stays until the sensor has left it behind."""
 
     def enter(self, target: LocalMap, points: PreparedPoints, T_world_lidar: Floats) -> None:
-        """Add to the map."""
+        """Add the scan to the map."""
         target.insert(points.map_points, points.source, T_world_lidar)
 
 
@@ -126,7 +126,7 @@ class LastScan(MapScans):
         self.takes_source = takes_source
 
     def enter(self, target: LocalMap, points: PreparedPoints, T_world_lidar: Floats) -> None:
-        """Replace the map."""
+        """Replace the map by the scan."""
         is_few = self.takes_source and len(target) > 0
         target.clear()
         target.insert(points.source.astype(np.float32) if is_few else points.map_points, points.source, T_world_lidar)
@@ -157,5 +157,5 @@ class LastKeyframes(MapScans):
             self.insert(target, keyframe_cloud, pose)
 
     def insert(self, target: Any, cloud: Any, T_world_lidar: Floats) -> None:
-        """Add what a map of this kind takes of a scan."""
+        """Add the points of one keyframe to the map."""
         target.insert(cloud.map_points, cloud.source, T_world_lidar)

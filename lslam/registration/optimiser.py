@@ -41,7 +41,7 @@ class Annealing:
 
     @classmethod
     def slow(cls, width: float) -> Annealing:
-        """From `width`, m, so slowly that coarse planes are followed."""
+        """Widths from `width`, m, on that narrow slowly, for coarse planes and starts far off."""
         return cls(width, START_ITERATIONS, decay=COARSE_DECAY)
 
     @classmethod
@@ -51,9 +51,9 @@ class Annealing:
 
 
 class Correspondences:
-    """Correspondences of the `count` source points in an iteration: which have one, and squared distances; shared by the maps.
+    """Squared distances (count,), m2, of source points to their matches, negative without one; shared by the maps of a problem.
 
-    What was looked up in a map is remembered, for as long as that map stays as it is.
+    It also keeps the voxels that were looked up in each map, for reuse while that map is unchanged.
     """
 
     def __init__(self, count: int) -> None:
@@ -65,7 +65,7 @@ class Correspondences:
         return len(self.distance2)
 
     def clear(self) -> None:
-        """Nothing is matched."""
+        """Mark all points as unmatched."""
         self.is_done.fill(False)
         self.distance2.fill(-1.0)
 
@@ -78,7 +78,10 @@ class Correspondences:
 
 
 def slots_of(count: int) -> tuple[Longs, Ints]:
-    """Octant cells and slots of so many points, nothing looked up yet: what is not written is never paged in."""
+    """Arrays for the octant cells (count, ...) and voxel slots of so many points, nothing looked up yet.
+
+    The system provides memory only for what is written.
+    """
     return np.full(count, -1, np.int64), np.empty((count, 8), np.int32)
 
 

@@ -61,18 +61,18 @@ class NonGroundPoints:
             self._cells.insert(points[index], T_world_lidar)
 
     def agreeing(self, high: PreparedPoints, T_world_lidar: Floats) -> Bools:
-        """(S,) which of them have one of these points near by when seen from `T_world_lidar` (4, 4)."""
+        """Mask (S,) of the points `high` of another scan that have one of these near by, placed at `T_world_lidar` (4, 4)."""
         matches = Correspondences(len(high.source))
         terms = voxel_terms(MEANS, MEANS.points(high, NEAR_M), (self._cells,), matches, NEAR_M)
         normal_equations(terms, T_world_lidar, NEAR_M, matches)
         return (matches.distance2 >= 0) & (matches.distance2 < NEAR_M**2)
 
     def share(self, high: PreparedPoints, T_world_lidar: Floats) -> float:
-        """Which part of them does."""
+        """Share of the points `high` that `agreeing` marks, 0 to 1."""
         return np.count_nonzero(self.agreeing(high, T_world_lidar)) / max(len(high.source), 1)
 
     def align(self, high: PreparedPoints, T_start: Floats) -> RegistrationResult:
-        """Lay them on these points, point to point, from less than `START_STEP_M` away, with height and tilt as they are.
+        """Register the points `high` on these, point to point, in x, y and yaw only, starting less than `START_STEP_M` away.
 
         At the wrong height, or tilted by a degree, rings agree with those of another scan that hit something else.
         """
@@ -87,7 +87,7 @@ def ground_under(points: PreparedPoints, preprocess: PreprocessConfig) -> Ground
 
 
 def high_points(points: PreparedPoints, ground: Ground) -> PreparedPoints:
-    """What to look for among `NonGroundPoints` at some pose: the points of another scan that are high above its ground."""
+    """The points of a scan that are high above its ground, to be compared with `NonGroundPoints`."""
     above = points.map_points[ground.above(points.map_points, HIGH_M)]
     return PreparedPoints(above, above.astype(np.float64), np.zeros((len(above), 6)), len(above))
 
@@ -108,7 +108,10 @@ class StartSearch:
     name = "start search"
 
     def recover(self, attempt: Attempt, result: RegistrationResult) -> RegistrationResult:
-        """Acts while the map is made of the first scans and on failed ones; the second scan may lie anywhere in reach."""
+        """Search several starts if the result failed or the map is made of the first scans; else return `result`.
+
+        The second scan may lie anywhere in reach.
+        """
         is_settled = result.ok and not attempt.history.is_young
         if attempt.config.start_reach == 0 or is_settled:
             return result
@@ -167,7 +170,10 @@ def best_by_non_ground(
 def _best_start(
     attempt: Attempt, best: RegistrationResult, non_ground: NonGroundPoints, high: PreparedPoints
 ) -> RegistrationResult:
-    """The best of several starts: a few points on the coarse map show which are worth a whole registration."""
+    """The result from the best of several starts, if it is clearly better than `best`.
+
+    Every start is tried with a few points on the coarse map; the one with most agreement gets a whole registration.
+    """
     target, count = attempt.target, len(high.source)
     coarse_map, few = target.coarse_maps(attempt.points, attempt.T_prior)[0], few_of(attempt.points)
     slow = Annealing.slow(2 * START_STEP_M)
@@ -187,7 +193,10 @@ def _best_start(
 
 
 def _likeliest(non_ground: NonGroundPoints, high: PreparedPoints, T_prior: Floats, reach: float, up: Floats) -> Floats:
-    """(4, 4) pose up to `reach`, m, from the prior, or turned about `up`, at which most points have one near by."""
+    """The pose (4, 4) at which most points `high` agree with `non_ground`, of shifts and rotations of the prior.
+
+    reach : m, of the shifts; up : (3,) axis of the rotations, LiDAR frame
+    """
     moved = [T_prior @ se3.make(np.eye(3), offset) for offset in start_offsets(reach, NEAR_M, up)]
     turns = np.deg2rad(START_TURNS_DEG)
     turned = [T_prior @ se3.make(so3.exp(turn * up), np.zeros(3)) for turn in turns]
@@ -231,7 +240,10 @@ class CoarseToFine:
     name = "coarse-to-fine"
 
     def recover(self, attempt: Attempt, result: RegistrationResult) -> RegistrationResult:
-        """Acts while the speed is unknown, and on results that fail, correct their prior by much or agree less than usual."""
+        """Align coarse to fine if the speed is unknown, or the result failed, corrects its prior by much or has few inliers.
+
+        Returns the alignment with more inliers; otherwise `result`.
+        """
         usual, is_started = attempt.history.agreement, attempt.history.starting == 0
         is_certain = result.ok and attempt.is_small(result) and is_started
         if is_certain and (self.of_features or not usual.is_less(result.agreement)):
@@ -255,16 +267,19 @@ class CoarseToFine:
 
 
 class AtRest:
-    """Holds a sensor where it stood, as long as fewer things must have moved for that than for its own motion.
+    """Keeps a sensor at rest where it stood, unless more objects must have moved for that than if the sensor moved.
 
-    At the lights the surfaces of vehicles hold a sensor best. Where they drive off together, their points outnumber those of
-    the street, all of which must have come along if the sensor moved.
+    At traffic lights most points lie on vehicles. Where these drive off together, their points outnumber those of the street,
+    all of which must have come along if the sensor moved.
     """
 
     name = "at rest"
 
     def recover(self, attempt: Attempt, result: RegistrationResult) -> RegistrationResult:
-        """Acts on results that leave the spot on which the sensor stood."""
+        """The pose where the sensor stood, if the result leaves that spot and fewer objects moved if the sensor still stands.
+
+        Otherwise `result`.
+        """
         rest, T_registered = attempt.history.rest, result.T_world_lidar
         is_standing = rest.scans >= attempt.config.start_scans
         if not (result.ok and is_standing) or rest.is_here(T_registered, result.lever_arm):

@@ -62,7 +62,7 @@ class Registration(Stateful):
         self._last, self._index = (np.eye(4), np.eye(4)), 0
 
     def fresh(self) -> Registration:
-        """An empty one of the same settings."""
+        """A new registration with an empty map and the same settings."""
         return Registration(self.config, self.preprocess, target=self.target.fresh(), policies=self.policies)
 
     @property
@@ -114,7 +114,7 @@ class Registration(Stateful):
         return replace(result, points=points)
 
     def attempt(self, points: Any, T_prior: Floats, is_near: bool = False, clock: StageClock | None = None) -> Attempt:
-        """The scan as the policies see it."""
+        """The scan with its prior (4, 4), target and history, as recovery policies take it."""
         ready = self.target.ready(points)
         return Attempt(self.target, ready, T_prior, self.config, self.history, is_near, clock or StageClock())
 
@@ -133,10 +133,9 @@ class Registration(Stateful):
         return result
 
     def _own_share(self, result: RegistrationResult) -> float:
-        """Inlier share of the first scan on the map that it made: so much can agree where the pose is right.
+        """Inlier share of the first scan on the map that it made itself: the largest that a right pose can be expected to have.
 
-        It has the scale of the scene, the voxels and the noise in it: a share of 16 % is right in a small room, and wrong in a
-        street.
+        It depends on scene, voxels and noise: a share of 16 % is right in a small room, and wrong in a street.
         """
         attempt = self.attempt(result.points, result.T_world_lidar)
         return float(self.target.align(attempt, result.T_world_lidar, Annealing.once(KERNEL_MIN_M)).inlier_share)

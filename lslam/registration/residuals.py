@@ -18,20 +18,24 @@ Arrays = tuple[Any, ...]
 
 
 def _alone(points: PreparedPoints, sigma: float) -> Arrays:
+    """The source points alone."""
     return (points.source,)
 
 
 def _with_scatter(points: PreparedPoints, sigma: float) -> Arrays:
+    """The source points and the scatter of the points behind each."""
     return points.source, points.scatter
 
 
 def _with_gaps(points: PreparedPoints, sigma: float) -> Arrays:
+    """The source points and the gap between rings at each, m; 0 where it was not computed."""
     from numpy import zeros
 
     return points.source, zeros(len(points.source)) if points.gaps is None else points.gaps
 
 
 def _with_covariance(points: PreparedPoints, sigma: float) -> Arrays:
+    """The source points and the covariance of the surface at each, computed here if the points lack it."""
     from lslam.registration.gaussian_map import source_covariance
 
     if points.covariance is not None:
@@ -40,14 +44,17 @@ def _with_covariance(points: PreparedPoints, sigma: float) -> Arrays:
 
 
 def _planes(target: GaussianMap) -> Arrays:
+    """Planes of the voxels, with their hash table."""
     return target.planes, target.keys, target.table
 
 
 def _counted_planes(target: GaussianMap) -> Arrays:
+    """Planes of the voxels and the number of points of each, with their hash table."""
     return target.planes, target.refreshed, target.keys, target.table
 
 
 def _shapes(target: GaussianMap) -> Arrays:
+    """Full Gaussians of the voxels, with their hash table."""
     return target.shapes(), target.keys, target.table
 
 

@@ -56,6 +56,7 @@ class RestDetector(Stateful):
         return result
 
     def _is_near(self, result: RegistrationResult) -> bool:
+        """Whether the result's pose equals the reference's within the noise of a point and its covariance."""
         C, T, reference = result.covariance, result.T_world_lidar, self._reference
         if reference is None or C is None or not result.is_accepted:
             return False
@@ -74,7 +75,7 @@ TELLING_CHI2 = 0.5
 
 @dataclass(frozen=True)
 class Votes:
-    """Things that fit where they were, and things that fit the motion: all others tell nothing."""
+    """Objects that fit the sensor standing (`stay`) and its motion (`move`); all others do not count."""
 
     stay: int
     move: int
@@ -86,9 +87,10 @@ class Votes:
 
 
 class PlanWalls:
-    """Vertical surfaces of a scan, in plan: a façade of few rings far away has no plane in a voxel, and a line here.
+    """Vertical surfaces of a scan, as lines seen from above.
 
-    A thing is a wall where its points are thin in plan, and lie across beams (`LEAST_BREADTH`): a ring on a slope is thin, too.
+    A façade far away, seen by few rings, has no plane in a voxel, but a line here. A voxel has a wall where its points are thin
+    seen from above, and lie across beams (`LEAST_BREADTH`): a ring on a slope is thin, too.
 
     cloud : (N, 3) m, LiDAR frame
     sigma : m, noise of a point
@@ -123,7 +125,10 @@ class PlanWalls:
         self._is_wall = (thick < self._sigma2) & (np.minimum((xx + yy) / 2 + spread, zz) > LEAST_BREADTH * thick)
 
     def votes(self, cloud: NDArray[np.float32], motion: Floats) -> Votes:
-        """How many things of a later scan (N, 3) fit better if the sensor stands, and how many if it came by `motion` (4, 4)."""
+        """Number of objects of a later scan (N, 3) that fit the walls better if the sensor stands, and if it moved.
+
+        motion : (4, 4) pose of the later scan relative to the first
+        """
         ground = ground_of(cloud, up_of(self._preprocess))
         points = cloud[ground.above(cloud)].astype(np.float64)
         if not len(self._mean) or not len(points):
@@ -140,7 +145,10 @@ class PlanWalls:
         return Votes(*(int(np.count_nonzero(sign * sums > INLIER_CHI2)) for sign in (1, -1)))
 
     def _cost(self, points: Floats) -> tuple[Floats, Bools]:
-        """(N,) squared sigmas of levelled points from their wall, NaN where none is known, and whether anything is near."""
+        """(N,) squared distances, in sigmas, of levelled points from the nearest wall, bounded; and whether a voxel is near.
+
+        NaN where the near voxel is no wall.
+        """
         away, near = self._tree.query(points[:, :2], distance_upper_bound=self._voxel_size)
         is_near = np.isfinite(away)
         near = np.where(is_near, near, 0)
@@ -150,7 +158,7 @@ class PlanWalls:
 
 
 def _connect(points: Floats, apart_m: float) -> Longs:
-    """(N,) numbers of the things that points (N, 2) in plan belong to, which lie `apart_m` from one another."""
+    """(N,) number of the object of each of points (N, 2), seen from above; objects lie at least `apart_m` from one another."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
@@ -161,9 +169,9 @@ def _connect(points: Floats, apart_m: float) -> Longs:
 
 
 class Rest(Stateful):
-    """The spot that the sensor has not left: the scan that it came with, its pose, and how many scans lie there since.
+    """The spot that the sensor has not left: its pose, the first scan there, and the number of scans since.
 
-    Walls tell of level motion alone, and so does this: a car that is about to start pitches.
+    Only motion in x, y and yaw counts, which walls observe: a car that is about to start pitches.
 
     sigma : m, noise of a point, by which two poses of one spot may differ
     voxel_size : m, as of `PlanWalls`
@@ -181,7 +189,10 @@ class Rest(Stateful):
         self._walls: PlanWalls | None = None
 
     def is_here(self, T_world_lidar: Floats, lever_arm: float) -> bool:
-        """Whether a pose (4, 4) is the spot, within what registrations of one spot differ by: a sigma at least, three at most."""
+        """Whether a pose (4, 4) differs from the spot by no more than registrations there do: one to three sigma of a point.
+
+        lever_arm : m, at which rotation counts
+        """
         usual = float(np.sqrt(INLIER_CHI2 * self._squares / self.scans))
         return self._away(T_world_lidar, lever_arm) < min(max(usual, self.sigma), self._reach)
 
@@ -191,7 +202,7 @@ class Rest(Stateful):
         return float(np.sqrt(INLIER_CHI2)) * self.sigma
 
     def _away(self, T_world_lidar: Floats, lever_arm: float) -> float:
-        """m from the spot to a pose (4, 4), but for height and tilt, for a point at the `lever_arm`, m."""
+        """Distance, m, of a pose (4, 4) from the spot in x, y and yaw, at the `lever_arm`, m."""
         change = noise.changes(self.T_world_lidar, T_world_lidar)
         level = change - upright_directions(self.T_world_lidar, up_of(self.preprocess)) @ change
         return float(np.linalg.norm(level[:3]) + np.linalg.norm(level[3:]) * lever_arm)
@@ -206,7 +217,10 @@ class Rest(Stateful):
             self.scans, self._squares = 1, 0.0
 
     def votes(self, cloud: NDArray[np.float32], T_world_lidar: Floats) -> Votes:
-        """Of a scan (N, 3) for the spot, and for the pose (4, 4)."""
+        """Votes of a later scan (N, 3), m, LiDAR frame, on the walls at the spot: the sensor stands there, or at another pose.
+
+        T_world_lidar : (4, 4), that other pose
+        """
         assert self._cloud is not None
         if self._walls is None:
             self._walls = PlanWalls(self._cloud, self.preprocess, self.sigma, self.voxel_size)

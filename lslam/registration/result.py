@@ -74,9 +74,10 @@ class RegistrationResult:
         iterations: int,
         converged: bool,
     ) -> RegistrationResult:
-        """Where iterations from `T_start` (4, 4) ended, or the start where that is not finite.
+        """The result of an iteration from `T_start` (4, 4) to `pose` (4, 4); a failed one at the start if `pose` is not finite.
 
-        H, facts, step : (6, 6) and sums of the last linearisation, and (6,) its step; weak : (K, 6) unobserved directions
+        H, facts, step : (6, 6), and sums of the points (`kernels.linearisation`), of the last linearisation, and (6,) its step
+        weak : (K, 6) unobserved directions
         """
         f = facts.tolist()
         is_finite = bool(np.isfinite(pose).all() and np.isfinite(step).all())
@@ -108,7 +109,7 @@ class RegistrationResult:
         return replace(self, T_world_lidar=T_world_lidar, covariance=covariance)
 
     def reject(self, reason: str, T_world_lidar: Floats, covariance: Floats | None) -> RegistrationResult:
-        """The scan at another pose, since something contradicts the registration."""
+        """The result with another pose and covariance, rejected for the `reason`: something contradicts the registration."""
         moved = self.with_pose(T_world_lidar, covariance)
         return replace(moved, is_rejected=True, reason=reason, converged=False)
 

@@ -47,28 +47,28 @@ class VoxelTarget(MapAlignment, Target):
         self.preprocess, self.scans = preprocess, scans
 
     def fresh(self) -> VoxelTarget:
-        """An empty one of the same settings."""
+        """A new target with an empty map and the same settings."""
         return VoxelTarget(self.config, self.preprocess)
 
     def __len__(self) -> int:
         return len(self.map)
 
     def count(self, points: PreparedPoints) -> int:
-        """Source points."""
+        """Number of source points."""
         return len(points.source)
 
     def refusal(self, points: PreparedPoints) -> str:
-        """Too few points."""
+        """The reason not to register a scan: it has too few points; else empty."""
         count = len(points.source)
         return "" if count >= MIN_SOURCE_POINTS else f"{count} usable points, {MIN_SOURCE_POINTS} needed"
 
     def ready(self, points: PreparedPoints) -> PreparedPoints:
-        """With the covariance of the surface, or the gap between the rings, at each point, where the residual takes it."""
+        """The points with covariances, or with gaps between rings, where the residual needs them."""
         points = self.with_covariance(points)
         return replace(points, gaps=self._gaps(points)) if self.kind.needs_gaps else points
 
     def with_covariance(self, points: PreparedPoints) -> PreparedPoints:
-        """With the covariance of the surface at each point, where the residual takes it."""
+        """The points with the covariance of the surface at each, where the residual needs it."""
         if not self.kind.needs_covariance or points.covariance is not None:
             return points
         c = self.config
@@ -85,7 +85,7 @@ class VoxelTarget(MapAlignment, Target):
         )
 
     def capture(self, attempt: Attempt) -> RegistrationResult:
-        """Aligned with the coarse planes, then with the fine ones, and judged."""
+        """Align from a prior that may be metres off, coarse to fine, and check the result."""
         return attempt.judge(self.coarse_to_fine(attempt.points, attempt.T_prior))
 
     def warm_up(self) -> None:
@@ -105,7 +105,7 @@ class VoxelTarget(MapAlignment, Target):
         return points.map_points
 
     def _gaps(self, points: PreparedPoints) -> Floats | None:
-        """(S,) m, ring spacing at each source point; None where few are farther apart than a voxel is wide."""
+        """(S,) m between rings at each source point; None where nearly all are smaller than a voxel."""
         if self._ring_gap is None:
             self._ring_gap = ring_gap(points.map_points)
         gaps: Floats = self._ring_gap * np.linalg.norm(points.source, axis=1)
@@ -113,7 +113,7 @@ class VoxelTarget(MapAlignment, Target):
 
 
 def make_map_scans(config: RegistrationConfig) -> MapScans:
-    """The choice that `config.target` names."""
+    """The rule, named by `config.target`, of which scans make the local map: all, the last ones, or keyframes."""
     if config.target == "submap":
         return KeyframeSubmap()
     if config.target == "keyframe":

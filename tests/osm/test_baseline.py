@@ -9,7 +9,7 @@ from wall_scenes import block, box_at, plain, turned
 
 from lslam.core.geometry import se2
 from lslam.core.types.building import Building, Footprint
-from lslam.osm.baseline_matcher import flatten_scan, lay_building, lay_scan, outline_points
+from lslam.osm.baseline_matcher import align_building, align_scan, flatten_scan, outline_points
 from lslam.osm.walls import walls_of
 
 Floats = NDArray[np.float64]
@@ -37,7 +37,7 @@ def test_the_scan_finds_its_place_among_all_buildings(seed: int) -> None:
     rng = np.random.default_rng(seed)
     truth = np.array([30.0, -12.0, rng.uniform(-3, 3)])
     walls = turned(walls_of(village())[0], (truth[0], truth[1], truth[2]))
-    found = lay_scan(flatten_scan(scan(seed), 60.0), walls, truth + rng.uniform(-1, 1, 3) * [0.8, 0.8, 0.04])
+    found = align_scan(flatten_scan(scan(seed), 60.0), walls, truth + rng.uniform(-1, 1, 3) * [0.8, 0.8, 0.04])
     assert found is not None
     assert np.linalg.norm(found.pose[:2] - truth[:2]) < 0.15
     assert abs(se2.wrap(found.pose[2] - truth[2])) < np.radians(0.6)
@@ -50,7 +50,7 @@ def test_a_building_is_laid_on_what_is_seen_of_it(building: int) -> None:
     house = village()[building]
     walls, _ = walls_of([house])
     truth = np.append(house.middle, 0.0)
-    found = lay_building(walls - house.middle, seen, np.add(truth, [0.5, -0.4, 0.03]))
+    found = align_building(walls - house.middle, seen, np.add(truth, [0.5, -0.4, 0.03]))
     assert found is not None
     assert np.linalg.norm(found.pose[:2] - truth[:2]) < 0.3
     assert abs(found.pose[2]) < np.radians(2)
@@ -70,7 +70,7 @@ def test_what_is_below_the_horizon_is_cut_off_and_the_rest_is_flat_and_thin() ->
 def test_no_match_without_points_or_overlap() -> None:
     seen = flatten_scan(scan(0), 60.0)
     walls, _ = walls_of(village())
-    assert lay_scan(np.zeros((0, 2)), walls, np.zeros(3)) is None
-    assert lay_scan(seen, np.zeros((0, 2, 2)), np.zeros(3)) is None
-    assert lay_scan(seen, walls + 500.0, np.zeros(3)) is None
-    assert lay_building(walls[:4] - [200.0, 0.0], seen, np.zeros(3)) is None
+    assert align_scan(np.zeros((0, 2)), walls, np.zeros(3)) is None
+    assert align_scan(seen, np.zeros((0, 2, 2)), np.zeros(3)) is None
+    assert align_scan(seen, walls + 500.0, np.zeros(3)) is None
+    assert align_building(walls[:4] - [200.0, 0.0], seen, np.zeros(3)) is None

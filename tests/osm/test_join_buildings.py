@@ -13,7 +13,7 @@ from lslam.core.geometry import se3
 from lslam.core.types.building import Building, Footprint, OsmMatches
 from lslam.core.types.constraint import Constraint
 from lslam.io.formats.osm_buildings import BuildingExtract
-from lslam.osm.baseline_matcher import lay
+from lslam.osm.baseline_matcher import fit_buildings
 
 
 class NothingSeen:
@@ -42,7 +42,7 @@ def test_a_rejected_fix_does_not_affect_the_baseline() -> None:
     house = Building("way/1", (Footprint(np.array([[200.0, 0], [210, 0], [210, 10], [200, 10]])),))
     extract = BuildingExtract([house], {}, np.array([49.0, 8.4, 0.0]), None, "a map")
     inputs = BackEndInput([], NothingSeen(), Config(), [])  # type: ignore[arg-type]
-    fit = lay(
+    fit = fit_buildings(
         graph,
         solution,
         OsmMatches(extract.origin, (), np.zeros((0, 2, 2)), np.zeros(0, np.int64), (), ()),

@@ -201,6 +201,6 @@ def test_a_run_without_enough_fixes_reports_what_is_needed() -> None:
 
 
 def test_an_unknown_matcher_is_refused_before_a_run() -> None:
-    assert all(callable(matcher.lay) for matcher in MATCHERS.values())
+    assert all(callable(matcher.fit_buildings) for matcher in MATCHERS.values())
     with pytest.raises(UsageError, match=r"no matcher 'wals' \(osm.matcher\); did you mean 'walls'"):
         check_config(load_config(None, ["osm.matcher=wals"], {}))

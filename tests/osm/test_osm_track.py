@@ -75,7 +75,7 @@ def laid_on(
         KeyframeMatch(k, np.zeros((0, 2, 2)), np.zeros((1, 2)), pose, np.ones(3), pose, known, rank=3)
         for k, (pose, known) in enumerate(zip(real, information, strict=True))
     ]
-    turn, squared = track().lay(told, 5.0 * np.arange(len(told)), matches, sigma)
+    turn, squared = track().align(told, 5.0 * np.arange(len(told)), matches, sigma)
     return float(np.degrees(turn)), squared
 
 

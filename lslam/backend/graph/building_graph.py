@@ -104,7 +104,7 @@ def solve_buildings(
 
 
 def agreeing(middles: Floats, matches: Sequence[BuildingMatch], poses: Mapping[int, Floats]) -> Bools:
-    """(M,) true where `SUPPORT` other matches of the same building, which observe the same directions, agree.
+    """(M,) true where at least `SUPPORT` other matches of the same building agree that observe the same directions.
 
     One keyframe may match a hedge or the neighbour's wall; along a direction that no other match observes, it could not be
     rejected as an outlier.
@@ -216,7 +216,7 @@ def optimise_jointly(
 
 
 def _seen_from(match: BuildingMatch) -> PlanarPrior:
-    """The keyframe in the axes of the building, from the building in those of the keyframe."""
+    """The match inverted: pose of the keyframe in the building's axes, with its information there, as a planar prior."""
     pose = se2.inverse(match.pose)
     back = np.zeros((3, 3))
     back[:2, :2] = -se2.rotation(-match.pose[2])
@@ -234,6 +234,7 @@ def _sigma(map_prior: MapPrior | None, is_first: bool) -> Floats:
 
 
 def _own(key: int, pose: Floats, sigma: Floats) -> Any:
+    """Prior factor of gtsam on a building's pose `key`: at `pose` (4, 4), with sigmas (3,) of x, y (m), yaw (rad)."""
     import gtsam
 
     spread = np.diag(np.array([*sigma[:2], FIRM, FIRM, FIRM, sigma[2]]) ** 2)

@@ -28,9 +28,9 @@ LASTING, SIZES = (0.5, 0.9, 0.99), (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 
 
 def drift_covariance(way: float, config: GraphConfig) -> Floats:
-    """(6, 6) of a random walk over `way` m, in proportion `drift_percent` per m to `drift_deg_per_100m`, at factor 1.
+    """(6, 6) covariance of odometry's drift over `way` m as a random walk, at factor 1.
 
-    Its variance grows with the way, whatever the number of steps.
+    The sigmas are in the ratio of `drift_percent` to `drift_deg_per_100m`. The variance is proportional to the way.
     """
     turn = np.deg2rad(config.drift_deg_per_100m) / 100
     return np.diag(np.repeat([(0.01 * config.drift_percent) ** 2 * way, turn**2 * way], 3))
@@ -65,12 +65,15 @@ def drift_factor(graph: PoseGraph, loops: Sequence[Constraint], config: GraphCon
 
 
 def tilt_factor(graph: PoseGraph, config: GraphConfig) -> float:
-    """As `drift_factor` by the up directions alone: 0 unless a tilt of odometry is significant."""
+    """Factor on odometry's drift, as `drift_factor`, by the up directions alone: 0 unless a tilt of odometry is significant."""
     return _of_ups(graph, *chains(graph, config), config) if graph.ups else 0.0
 
 
 def chains(graph: PoseGraph, config: GraphConfig) -> tuple[Floats, Floats]:
-    """Odometry's covariances and drift of factor 1, both accumulated, (K, 6, 6)."""
+    """Covariances (K, 6, 6) of the keyframes' poses by odometry's own noise, and by drift of factor 1.
+
+    Both accumulate from the first keyframe on.
+    """
     steps = [c for c in graph.odometry if c.b == c.a + 1]
     b, own = np.array([c.b for c in steps], np.intp), np.array([c.covariance for c in steps]).reshape(-1, 6, 6)
     lengths = np.array([_length(c) for c in steps])
@@ -90,7 +93,10 @@ def _as_fixes(graph: PoseGraph) -> list[PositionFix]:
 
 
 def _accumulate(poses: Floats, b: NDArray[np.intp], own: Floats) -> Floats:
-    """(K, 6, 6) of each pose in the world by steps to keyframes `b` (P,) from those before, of covariances `own` (P, 6, 6)."""
+    """Covariances (K, 6, 6) of all poses from those of single steps.
+
+    b, own : (P,) keyframe at the end of each step, and (P, 6, 6) its covariance relative to the keyframe before
+    """
     # About one point the covariances of all steps add up.
     about_origin = np.zeros((len(poses), 6, 6))
     about_origin[b] = noise.transport(noise.rotate(own, poses[b - 1, :3, :3]), -poses[b, :3, 3])
@@ -98,7 +104,7 @@ def _accumulate(poses: Floats, b: NDArray[np.intp], own: Floats) -> Floats:
 
 
 def _between(chain: Floats, poses: Floats, a: NDArray[np.intp], b: NDArray[np.intp]) -> Floats:
-    """(P, 6, 6) of keyframes `b` relative to `a`, world axes."""
+    """Covariances (P, 6, 6) of keyframes `b` relative to `a`, world axes, by those of `chains`."""
     return np.asarray(chain[b] - noise.transport(chain[a], poses[b, :3, 3] - poses[a, :3, 3]))
 
 
@@ -199,6 +205,7 @@ def _fitting(error: Floats, own: Floats, drift: Floats) -> float:
 
 
 def _length(constraint: Constraint) -> float:
+    """Length of a constraint's translation, m."""
     return float(np.linalg.norm(constraint.T_a_b[:3, 3]))
 
 
@@ -267,10 +274,11 @@ def correct_drift(graph: PoseGraph, rates: Floats) -> PoseGraph:
 
 
 def _prior_sigmas(config: GraphConfig, axes: list[int]) -> Floats:
-    """(d, d) diagonal: one sigma of each rate."""
+    """(d, d) diagonal matrix of the prior sigmas of the drift rates along the axes, per m."""
     percent, turn = 0.01 * config.drift_percent, np.radians(config.drift_deg_per_100m) / 100
     return np.diag(np.repeat([percent, turn], 3)[axes])
 
 
 def _knots(length: float, apart: float) -> Floats:
+    """Positions of knots along a way of `length` m, at most `apart` m from one another."""
     return np.linspace(0.0, length, int(np.ceil(length / apart)) + 1)

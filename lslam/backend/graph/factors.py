@@ -46,12 +46,15 @@ def regularise(covariance: Floats) -> Floats:
 
 
 def between(constraint: Constraint, scale: float = 1.0, kernel: Any = None) -> Any:
-    """A relation between two keyframes; `scale` multiplies its covariance, `kernel` is an M-estimator of gtsam."""
+    """gtsam's factor of a measured pose between two keyframes.
+
+    scale : factor on its covariance; kernel : M-estimator of gtsam, None: not robust
+    """
     return between_makers([constraint])[0](scale, kernel)
 
 
 def between_all(constraints: Sequence[Constraint]) -> list[Any]:
-    """As `between` of each."""
+    """gtsam's factors of measured poses, as `between` for each constraint."""
     return [make(1.0, None) for make in between_makers(constraints)]
 
 
@@ -137,7 +140,7 @@ def _seen_from_above(planar: Floats, pose: Floats) -> Floats:
 
 
 def map_key(graph: PoseGraph) -> int:
-    """The key of the map's frame."""
+    """Key of the variable for the map's frame in gtsam's values."""
     return len(graph) + 1
 
 
@@ -174,7 +177,7 @@ def fixed_part(graph: PoseGraph, may_tilt: bool = False, with_lidar: bool = True
 
 
 def _relative(graph: PoseGraph, with_lidar: bool) -> list[Any]:
-    """Odometry, held loop closures and the IMU between keyframes."""
+    """Factors between keyframes: odometry and binding loop closures if `with_lidar`, and the IMU."""
     by_lidar = [*graph.odometry, *(loop for loop in graph.loops if loop.is_binding)] if with_lidar else []
     imu = [] if graph.inertial is None else inertial_factors(graph.inertial, graph.world_up)
     return [*between_all(by_lidar), *imu]
@@ -222,6 +225,7 @@ def poses_of(values: Any, count: int) -> Floats:
 
 
 def _turn(turn: Turn) -> Any:
+    """gtsam's factor of a measured rotation between two keyframes; the translation stays free."""
     import gtsam
 
     model = gtsam.noiseModel.Diagonal.Sigmas(np.array([turn.sigma] * 3 + [ANYWHERE] * 3))
@@ -230,6 +234,7 @@ def _turn(turn: Turn) -> Any:
 
 
 def _floor(floor: FloorPlane, key: int) -> Any:
+    """gtsam's factor of the floor seen from a keyframe; key : of the floor plane, common to all."""
     import gtsam
 
     # gtsam's planes are n . p + d = 0 with errors of direction (2) first, then of distance.
@@ -257,7 +262,7 @@ def _add_fix_noise(factors: Any, fix_noise: GaussMarkovNoise) -> None:
 
 
 def _floor_in_world(floors: Any, poses: Floats) -> Floats:
-    """(4,) the median of the floor planes."""
+    """(4,) median of the floor planes in the world: normal and offset."""
     normals = np.stack([poses[f.keyframe][:3, :3] @ f.normal for f in floors])
     normal = np.median(normals, axis=0)
     normal /= np.linalg.norm(normal)
@@ -266,6 +271,7 @@ def _floor_in_world(floors: Any, poses: Floats) -> Floats:
 
 
 def _robust(model: Any, kernel: Any) -> Any:
+    """The noise model with a robust kernel; itself without one."""
     import gtsam
 
     return model if kernel is None else gtsam.noiseModel.Robust.Create(kernel, model)
@@ -278,7 +284,10 @@ INTEGRATION = 1e-10
 def preintegrate(
     step: InertialStep, accel_bias: Floats, gyro_bias: Floats, gravity: Floats, imu_noise: SmootherNoise
 ) -> Any:
-    """`PreintegratedCombinedMeasurements` of the readings, linear in the biases (3,) about these; gravity (3,) in the world."""
+    """gtsam's `PreintegratedCombinedMeasurements` of the readings, linear in the biases (3,) about the given ones.
+
+    gravity : (3,) m/s2, world
+    """
     import gtsam
 
     one = np.eye(3)
@@ -300,7 +309,7 @@ FORCE_BIAS, RATE_BIAS = 0.1, 0.003
 
 
 def keyframe_of(key: int) -> int:
-    """The keyframe whose pose, velocity or biases have this key; any other key as it is."""
+    """Number of the keyframe that a key belongs to: of its pose, velocity or biases. Other keys are returned unchanged."""
     return key - next((first for first in (BIAS_KEY, SPEED_KEY) if key >= first), 0)
 
 

@@ -112,7 +112,10 @@ def _pairs(seconds: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 
 def _turn(own: Floats, displacements: Floats) -> float:
-    """Rotation, rad, that aligns `own` (P, 2) with `displacements` (P, 2); pairs without odometry or too long are ignored."""
+    """Rotation, rad, that aligns displacements `own` (P, 2) of odometry with `displacements` (P, 2) of fixes.
+
+    Pairs without odometry or too long are ignored.
+    """
     ok = np.isfinite(own).all(1)
     turn, weights = 0.0, ok.astype(float)
     for _ in range(4):
@@ -137,7 +140,7 @@ def _robust_sigma(residuals: Floats) -> float:
 
 
 def _sum_of_squares(sizes: Floats) -> float:
-    """Sum of squares of sizes in sigmas, an outlier counted as five; those without one as all others."""
+    """Robust sum of squares of residuals in sigmas: each counts as five at most, and a NaN as the mean of the others."""
     ok = np.isfinite(sizes)
     return float((np.minimum(sizes[ok], 5.0) ** 2).sum() * len(sizes) / max(ok.sum(), 1))
 

@@ -145,11 +145,12 @@ class _Fit:
         return size**2 * root @ root.T, float(WALKS @ likely.sum(1) / likely.sum())
 
     def _with_walk(self, walk: float) -> Floats:
+        """Covariance of the loop closures' residuals with a random walk of variance factor `walk` added."""
         return np.asarray(self._known + walk * self._walk)
 
 
 def _apart(distances: Floats) -> float:
-    """m from knot to knot."""
+    """Distance between two knots, m, for keyframes reached after `distances` (K,), m."""
     return max(KNOTS_APART_M, float(distances[-1]) / MOST_KNOTS)
 
 
@@ -189,13 +190,16 @@ def _effects(poses: Floats, distances: Floats, rotations: Floats) -> Iterator[tu
 
 
 def _walk_along(chain: Floats, keyframes: NDArray[np.intp], ends: Ends) -> Floats:
-    """(k, 6, 6 L) covariance of odometry's errors at keyframes (k,) with those that loop closures, a before b, observe."""
+    """(k, 6, 6 L) covariance between odometry's errors at keyframes (k,) and those over the L loop closures.
+
+    chain : (K, 6, 6) as of `_joint_covariance`
+    """
     last, first = (chain[np.minimum.outer(keyframes, end)] for end in (ends.b, ends.a))
     return np.asarray((last - first).transpose(0, 2, 1, 3).reshape(len(keyframes), 6, -1))
 
 
 def _joint_covariance(chain: Floats, ends: Ends) -> Floats:
-    """(6 L, 6 L) covariance of the residuals of loop closures, a before b: two share the errors of the way in common.
+    """(6 L, 6 L) covariance of the residuals of loop closures: two of them share the errors of their common way.
 
     chain : (K, 6, 6) of each pose's twist about the origin by errors of odometry
     """

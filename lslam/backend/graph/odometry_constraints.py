@@ -56,7 +56,10 @@ def odometry_constraints(
 
 
 def in_plane(covariance: Floats) -> Floats:
-    """The covariance (6, 6) of a step of a graph of two dimensions: height, roll and pitch are as measured."""
+    """The covariance (6, 6) of an odometry step for a planar graph: height, roll and pitch get tiny, uncorrelated variances.
+
+    So they stay as odometry measured them.
+    """
     flat = np.diag(np.repeat([LEAST_M**2, LEAST_RAD**2], 3))
     flat[np.ix_(PLANAR, PLANAR)] = covariance[np.ix_(PLANAR, PLANAR)]
     return flat
@@ -180,6 +183,7 @@ def _covariance(
 
 
 def _of_map(result: ScanResult) -> Floats | None:
+    """Covariance (6, 6) of the pose by the local map's error alone, without that of the scan's registration; None if unknown."""
     if result.covariance is None:
         return None
     if result.registration_covariance is None:

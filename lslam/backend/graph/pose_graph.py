@@ -49,7 +49,7 @@ class Drift:
     rad_per_m: float
 
     def covariance(self, a: NDArray[Any], b: NDArray[Any]) -> Floats:
-        """(P, 6, 6) of the poses of keyframes `b` (P,) relative to `a` (P,): isotropic, with the lever arm of heading drift."""
+        """(P, 6, 6) covariances of keyframes `b` (P,) relative to `a` (P,), isotropic, with the lever arm of heading drift."""
         way = np.abs(self.distances[b] - self.distances[a])
         steps = np.linspace(0, 1, SAMPLES)
         between = np.round(a[:, None] + steps * (b - a)[:, None]).astype(np.intp)
@@ -98,14 +98,14 @@ class Ends:
         self.covariances = as_twists(np.stack([c.covariance for c in items]), self.T)
 
     def select(self, index: NDArray[Any]) -> Ends:
-        """Some of them."""
+        """The loop closures at `index`."""
         part = object.__new__(Ends)
         part.a, part.b, part.T, part.covariances = self.a[index], self.b[index], self.T[index], self.covariances[index]
         return part
 
 
 def as_twists(covariance: Floats, T: Floats) -> Floats:
-    """Covariances of t' = t + d[:3], R' = exp(d[3:]) R as those of exp(xi) T."""
+    """Covariances (..., 6, 6) of poses T, t' = t + d[:3], R' = exp(d[3:]) R, as those of left twists xi: T' = exp(xi) T."""
     return noise.transport(covariance, -T[..., :3, 3])
 
 
@@ -167,20 +167,23 @@ def _cycle_errors(
 
 
 def _propagate(covariance: Floats, T: Floats, to: Floats) -> Floats:
+    """Covariances of poses T (..., 4, 4) as those of left twists after composition with `to` (..., 4, 4) from the left."""
     return transport_twists(as_twists(covariance, T), to)
 
 
 def transport_twists(covariance: Floats, to: Floats) -> Floats:
-    """Covariances of twists before `to` (..., 4, 4) as those of twists after it."""
+    """Covariances of left twists of T as those of left twists of `to` T (..., 4, 4), by the adjoint."""
     A = se3.adjoint(to)
     return np.asarray(A @ covariance @ np.swapaxes(A, -1, -2))
 
 
 def _slack(count: int) -> Floats:
+    """(count, 6, 6) small isotropic covariances, for registration errors that a loop closure's own covariance lacks."""
     return _isotropic(np.full(count, SLACK_M), np.full(count, SLACK_RAD))
 
 
 def _isotropic(sigma_m: Floats, sigma_rad: Floats) -> Floats:
+    """(P, 6, 6) diagonal covariances of translation sigmas (P,), m, and rotation sigmas (P,), rad."""
     S = np.zeros((len(sigma_m), 6, 6))
     S[:, range(3), range(3)] = sigma_m[:, None] ** 2
     S[:, range(3, 6), range(3, 6)] = sigma_rad[:, None] ** 2

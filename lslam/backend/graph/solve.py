@@ -50,10 +50,10 @@ def solve(factors: Any, values: Any, config: GraphConfig) -> Any:
 
 
 def refine(factors: Any, values: Any, config: GraphConfig) -> Any:
-    """Gauss-Newton from `values` close to the solution, then `solve` where a step does not lower the cost. Errors as there.
+    """The values that minimise the error of `factors`, by Gauss-Newton from `values` close to them.
 
-    A step's linear cost predicts the cost after it. If the prediction holds within the optimiser's own tolerance, the next step
-    would lower the cost by no more than that, and is omitted.
+    It falls back to `solve` where a step does not lower the cost, and raises its errors. A step's linear cost predicts the cost
+    after it. If the prediction holds within the optimiser's tolerance, the next step would gain no more, and is omitted.
     """
     import gtsam
 
@@ -210,6 +210,7 @@ def are_binary(weights: Floats) -> bool:
 
 
 def _weight(candidates: Sequence[OutlierCandidate], plain: list[Any], weights: Floats) -> list[Any]:
+    """Factors of the candidates with positive weight, their covariances divided by the weights."""
     chosen = []
     for item, factor, weight in zip(candidates, plain, weights, strict=True):
         if weight > 0:

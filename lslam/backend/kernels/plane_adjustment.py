@@ -132,7 +132,10 @@ def across(n: Floats, C: Floats, out: Floats) -> None:
 
 @inline
 def lever(n: Floats, means: Floats, c: int, origins: Floats, k: int) -> tuple[float, float, float]:
-    """Effect of the turn of pose `k` about each axis on the distance of the mean of sighting `c` from a plane of normal `n`."""
+    """Change of the distance of a point from a plane of normal `n`, m per rad of pose `k` about each axis.
+
+    The point is the mean of sighting `c`.
+    """
     x, y, z = means[c, 0] - origins[k, 0], means[c, 1] - origins[k, 1], means[c, 2] - origins[k, 2]
     return y * n[2] - z * n[1], z * n[0] - x * n[2], x * n[1] - y * n[0]
 
@@ -149,7 +152,10 @@ def couple(
     x: Floats,
     z: Floats,
 ) -> None:
-    """Add to `z` (3,) the effect of the pose corrections x (K, 6) on a plane of normal `n`, by sighting `c`, unweighted."""
+    """Add to the residual changes `z` (3,) of a plane of normal `n` the effect of the pose corrections x (K, 6) by sighting `c`.
+
+    z : offset, m, and both slopes of the plane. The sighting counts with weight 1; arguments as of `equations`.
+    """
     for side in range(2):
         share = shares[c] if side else 1.0 - shares[c]
         if share == 0.0:

@@ -124,12 +124,12 @@ class KeyframeStore(Stateful):
         return self._keep(file, np.ascontiguousarray(values.view(np.float32)[..., 0].T), labels)
 
     def keep(self, keyframes: Sequence[Keyframe]) -> None:
-        """Hold these of the keyframes only, by their numbers, which begin at 0 again; their clouds stay where they are."""
+        """Restrict the store to these of its keyframes, numbered anew from 0; the files of all clouds remain."""
         self._files = [self._files[k.number] for k in keyframes]
         self.keyframes = [replace(k, number=number) for number, k in enumerate(keyframes)]
 
     def clear(self) -> None:
-        """Forget all keyframes, and remove those that the folder holds, of an earlier run too."""
+        """Remove all keyframes from the store and its folder, those of an earlier run too."""
         self.keyframes, self._files, self._memory = [], [], {}
         with self._lock:
             self._recent.clear()
@@ -166,6 +166,7 @@ class KeyframeStore(Stateful):
         return sum(self._path(file).stat().st_size for file in self._files)
 
     def _path(self, file: int) -> Path:
+        """File of a cloud by its number."""
         assert self.folder is not None
         return self.folder / f"{file:06d}.npz"
 
@@ -189,11 +190,11 @@ class PartOfStore(KeyframeStore):
         self.keyframes = [replace(k, number=number) for number, k in enumerate(self.whole)]
 
     def points(self, number: int) -> Points:
-        """Cloud of a keyframe."""
+        """Cloud (N, 3), m, LiDAR frame, of keyframe `number` of the part."""
         return self._store.points(self.whole[number].number)
 
     def labels(self, number: int) -> Labels | None:
-        """Classes of its points, where they are known."""
+        """Classes (N,) of the points of keyframe `number` of the part; None where they are unknown."""
         return self._store.labels(self.whole[number].number)
 
 
@@ -243,6 +244,7 @@ def keyframes_of(state: Mapping[str, NDArray[Any]]) -> list[Keyframe]:
 
 
 def _make(folder: Path) -> None:
+    """Make the folder; raises OutputError where that is impossible."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

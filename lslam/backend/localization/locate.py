@@ -195,15 +195,15 @@ class PlaceFinder:
         return Region(T[:2, 3], radius, float(np.arctan2(turn[1, 0], turn[0, 0])), min(radius / NEAR_M, float(np.pi)))
 
     def _drift(self, a: int, b: int) -> tuple[float, float]:
-        """m and rad that odometry may be wrong by between two keyframes."""
+        """Largest plausible error of odometry between keyframes `a` and `b`, m and rad."""
         c, way = self.config.loops, abs(float(self._distances[b] - self._distances[a]))
         turn = GATE_SIGMAS * np.deg2rad(c.drift_deg) / 100 * way
         return GATE_SIGMAS * 0.01 * c.drift_percent * way + 0.5 * turn * way, float(turn)
 
     def _same(self, one: Vote, other: Vote) -> bool:
-        """True when two votes agree on the start of the drive within odometry's uncertainty.
+        """Whether two votes imply the same start of the drive, within odometry's uncertainty.
 
-        Where it drifts by more than lies between two guesses, agreement is no evidence.
+        False where odometry drifts by more than two guesses are apart: agreement would be no evidence.
         """
         b = other.keyframe
         gap = se3.relative(one.T_level_odometry @ self._poses[b], other.T_level_odometry @ self._poses[b])
@@ -295,10 +295,10 @@ class MapFollower(Stateful):
         return MapFix(self.T, self.P, "held", result.overlap, result.inlier_share, (move, turn))
 
     def _align(self, alignment: MapAlignment, points: PreparedPoints, start: Floats) -> RegistrationResult:
-        """Registration from `start`; from the predicted pose, `self.T`, with its information as prior and a kernel as wide as
-        it is uncertain.
+        """Register the points on the map from `start` (4, 4).
 
-        A prior that is wider than the widest kernel serves as initial guess only, as does any other `start`.
+        From the predicted pose `self.T` the prediction's information is a prior, and the kernel is as wide as it is uncertain.
+        If that exceeds the widest kernel, the prediction is only the start. So is any other `start`.
         """
         c = self.config.registration
         width = max(self._uncertainty_m(), RECOVER_M)
@@ -332,11 +332,12 @@ class MapFollower(Stateful):
         return SIGMAS * float(np.sqrt(position + LEVER_M**2 * turn))
 
     def _propagate(self, status: FixStatus, reason: str, result: RegistrationResult | None = None) -> MapFix:
+        """The fix of a scan that is not registered on the map: odometry's predicted pose and covariance, and the `reason`."""
         overlap, share = (0.0, 0.0) if result is None else (result.overlap, result.inlier_share)
         return MapFix(self.T, self.covariance, status, overlap, share, reason=reason)
 
 
 def mark_doubts(fixes: list[MapFix]) -> list[MapFix]:
-    """The fixes of a run, marked where fewer points agree with the map than two scans of one place differ by."""
+    """The fixes of a run, marked as doubtful where fewer points agree with the map than scans of one place differ by."""
     usual = float(np.median([fix.inlier_share for fix in fixes if fix.is_binding] or [0.0]))
     return [replace(f, is_doubtful=f.is_binding and f.inlier_share < UsualAgreement.LESS * usual) for f in fixes]

@@ -246,7 +246,7 @@ class PlaceSearch:
         ]
 
     def _look(self, views: TurnedViews, shift: Floats, heading: int) -> tuple[Floats, int, float]:
-        """Shift (2,) m, heading and score of the fine cell and heading that fit best about coarse ones."""
+        """Refine a coarse match: shift (2,), m, heading and score of the fine cell and heading nearby that fit best."""
         corner = np.round(shift / CELL_M).astype(np.int64) + (self.grid.size - WINDOW.size) // 2
         best = shift, heading, 0.0
         for n in range(heading - COARSE // 2, heading + COARSE // 2 + 1):
@@ -329,7 +329,7 @@ def _coarse(heights: Image, visible: Image) -> Image:
 
 
 def _least(squares: Image) -> float:
-    """Sum of the squares of a structure of which a map must have observed so much."""
+    """The sum of squares of a structure that a map must have observed, as a part of the whole."""
     return SHARED_SHARE * float(squares.sum())
 
 

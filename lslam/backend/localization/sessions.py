@@ -73,11 +73,11 @@ class Chain:
         return int(self.firsts[-1])
 
     def session_of(self, number: int) -> int:
-        """Which session a keyframe belongs to."""
+        """Index of the session that keyframe `number` belongs to."""
         return int(np.searchsorted(self.firsts, number, side="right")) - 1
 
     def part(self, session: int) -> slice:
-        """The keyframes of a session."""
+        """Slice of the chain's keyframes that belong to a session."""
         return slice(int(self.firsts[session]), int(self.firsts[session + 1]))
 
     def cloud(self, number: int) -> Points:
@@ -92,7 +92,7 @@ class Chain:
         return np.concatenate(self._whole)
 
     def odometry(self) -> list[Constraint]:
-        """From each keyframe to the next with the growth of odometry's covariance; from session to session by the ties."""
+        """Constraints from each keyframe to the next: odometry within a session, and `_break` from one session to the next."""
         out: list[Constraint] = []
         for n, session in enumerate(self.sessions):
             if n:
@@ -163,10 +163,10 @@ def tie(
     should_stop: Callable[[], bool] = lambda: False,
     vicinity: Vicinity | None = None,
 ) -> tuple[Session | None, str]:
-    """Locate a session in the map of the `others`: the session in their world, or None and the reason.
+    """Locate a session in the map of the `others`: the session with its pose in their world, or None and the reason.
 
     vicinity : position and radius to search in, instead of the georeferences
-    should_stop : asked between keyframes; the result is None then
+    should_stop : called between keyframes; if it returns True the result is None
     """
     cloud = np.concatenate([_cloud_of(s) for s in others])
     prior_map = make_prior_map(
@@ -214,7 +214,7 @@ class _AtFinalPoses(KeyframeStore):
         self.keyframes, self._clouds = session.keyframes, session.store
 
     def points(self, number: int) -> Points:
-        """Cloud of a keyframe."""
+        """Cloud (N, 3), m, of keyframe `number`, LiDAR frame."""
         return self._clouds.points(number)
 
 

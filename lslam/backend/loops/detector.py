@@ -154,7 +154,10 @@ class Detector:
         return self._candidate(a, b, check, is_binding=not check.reason)
 
     def _due_after(self, b: int, gates: SharedResults[Longs], throttle: LoopThrottle) -> Iterator[int]:
-        """Keyframes after `b` that will be verified if all verdicts equal the last one; for threads that work ahead."""
+        """Numbers of the keyframes after `b` that would be verified next if all verdicts equal the last one.
+
+        Threads prepare these ahead.
+        """
         throttle = copy(throttle)
         throttle.observe(self.keyframes[b].distance, throttle.last or Verdict.ACCEPTED)
         for n in range(b + 1, min(b + CACHE_GATES, len(self.keyframes))):
@@ -186,7 +189,10 @@ class Detector:
         self.uncertainty = OdometryUncertainty(self.keyframes, self.config.drift_percent, self.config.drift_deg)
 
     def _rehearse(self, limit: float, should_stop: Callable[[], bool]) -> Longs:
-        """(K,) place of each keyframe: its predecessor's, if that place's first is near and their descriptors within `limit`."""
+        """(K,) number of the place of each keyframe, where successive similar keyframes are one place.
+
+        A keyframe begins a new place if it is far from the first of the present one, or their descriptors differ by over `limit`.
+        """
         place_of, first = np.zeros(len(self.keyframes), np.int64), 0
         for k in range(1, len(self.keyframes)):
             _stop_if(should_stop(), k, len(self.keyframes))
@@ -203,7 +209,10 @@ class Detector:
         return self.uncertainty.gate(b, among, self.config.min_travel, self.config.radius, 0.0)
 
     def _filter_forbidden(self, b: int, among: Longs) -> Longs:
-        """Those that no forbidden pair lies at: so near along the way the same surfaces are taken for the same place."""
+        """The keyframes of `among` that are not near a forbidden pair of `b`, along the way.
+
+        Within that distance the same surfaces would be taken for the same place again.
+        """
         distances = self.uncertainty.distances
         for older, newer in self.forbidden:
             if abs(distances[b] - distances[newer]) <= NEAR_M:
@@ -211,10 +220,12 @@ class Detector:
         return among
 
     def _nearest(self, older: Longs, b: int) -> int:
+        """Number of the one of `older` that is nearest to keyframe `b` by odometry."""
         away = np.linalg.norm(self.uncertainty.positions[older] - self.uncertainty.positions[b], axis=1)
         return int(older[away.argmin()])
 
     def _away(self, a: int, b: int) -> float:
+        """Distance, m, between two keyframes by odometry."""
         return float(np.linalg.norm(self.uncertainty.positions[b] - self.uncertainty.positions[a]))
 
     def _choose(self, b: int, older: Longs) -> tuple[list[PlaceMatch], Callable[[], list[PlaceMatch]]]:
@@ -237,11 +248,11 @@ class Detector:
         return alike, lambda: self._elsewhere(self._matches(b, nearest), alike)
 
     def _elsewhere(self, matches: list[PlaceMatch], others: list[PlaceMatch]) -> list[PlaceMatch]:
-        """Those of the matches that are not at the place of a chosen one."""
+        """Those of the `matches` that are far from all `others`."""
         return [m for m in matches if all(self._away(m.number, c.number) > NEAR_M / 2 for c in others)]
 
     def _alike(self, b: int, older: Longs) -> list[PlaceMatch]:
-        """Those of the `older` that look like keyframe `b`: the most similar and its rivals."""
+        """Matches of keyframe `b` among `older`: the most similar keyframe and those that are nearly as similar."""
         near = self._nearest(older, b)
         matches = self._matches(b, older[self._is_described[older] | (older == near)])
         limit = min(self.config.max_descriptor_distance, RIVAL * matches[0].distance)
@@ -285,21 +296,21 @@ class Detector:
         return LoopCandidate(a, b, self._away(a, b), descriptor_distance, *verdict_facts, constraint)
 
     def _reach_between(self, older: int, newer: int) -> float:
-        """m, gate of odometry between two keyframes."""
+        """Gate of odometry on the position between two keyframes, m."""
         return self._reach(self.uncertainty.between(newer, np.array([older])))
 
     def _reach(self, uncertainty: RelativeUncertainty) -> float:
-        """m, gate on the position."""
+        """Gate on the position, m: so far off may the newer keyframe be."""
         if self.config.radius is not None:
             return self.config.radius
         return max(GATE_SIGMAS * float(uncertainty.reach[0]), LEAST_REACH)
 
     def _turn(self, uncertainty: RelativeUncertainty) -> float:
-        """rad, gate on the heading."""
+        """Gate on the heading, rad: by so much may it be wrong."""
         return max(GATE_SIGMAS * float(uncertainty.turn[0]), float(LEAST_TURN))
 
     def _yaws(self, match: PlaceMatch, turn: float) -> Floats:
-        """rad, headings of the newer submap in the older to search."""
+        """Yaw angles, rad, of the newer submap in the older one to be searched; turn : rad, odometry's gate on the heading."""
         centre, spread = (0.0, turn) if turn <= WIDEST_TURN else (match.yaw, self.index.yaw_error + TURN_STEP)
         count = int(np.ceil(spread / TURN_STEP))
         return np.asarray(centre + TURN_STEP * np.arange(-count, count + 1))
@@ -336,11 +347,13 @@ class Detector:
         return move_points(self.cloud(number), se3.make(self.keyframes[number].T_world_lidar[:3, :3], np.zeros(3)))
 
     def _describe(self, number: int) -> None:
+        """Add the descriptor of keyframe `number` to the index."""
         points = self._clouds.get(number)
         with self._index_lock:
             self.index.add(number, points)
 
 
 def _stop_if(is_stopping: bool, b: int, count: int) -> None:
+    """Raise InterruptedRunError if the run is stopping; b, count : keyframe and number of keyframes, for the message."""
     if is_stopping:
         raise InterruptedRunError(f"interrupted during loop closure detection, at keyframe {b} of {count}")

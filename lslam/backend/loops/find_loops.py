@@ -93,6 +93,7 @@ def _detector(
     forbidden: Sequence[tuple[int, int]] = (),
     up: Floats = Z,
 ) -> Detector:
+    """A detector over `keyframes`, with submaps of the store's clouds at their poses."""
     poses = np.array([keyframe.T_world_lidar for keyframe in keyframes]).reshape(-1, 4, 4)
     return Detector(
         keyframes, lambda number: submap(store, poses, number, submap_size), config, registration, forbidden, up
@@ -131,7 +132,7 @@ def view_pairs(record: RunRecord, store: KeyframeStore, size: int) -> list[PairV
 
 
 def view_pair(store: KeyframeStore, candidate: LoopCandidate, T_world_a: Floats, size: int, most: int) -> PairView:
-    """The view of a candidate.
+    """The submaps of both keyframes of a candidate, for people to compare in the report.
 
     T_world_a : (4, 4) the older keyframe in a level world; size : keyframes whose clouds make a submap
     most : points of each cloud that are kept

@@ -121,7 +121,7 @@ class LoopThrottle:
         self.reset()
 
     def reset(self) -> None:
-        """Attempt at the next candidate: there were none."""
+        """Make the next candidate due, whatever its distance: the last keyframe had none."""
         self._tried_at, self._row = -np.inf, 0
         self.last: Verdict | None = None
 
@@ -289,6 +289,7 @@ class WorkingMemory:
         return np.asarray(searchable[searchable < keyframe])
 
     def _enter(self, place: int) -> None:
+        """Enter a place into the working memory, unless it is there."""
         at = bisect_left(self._members, place)
         if at == len(self._members) or self._members[at] != place:
             self._members.insert(at, place)
@@ -296,6 +297,7 @@ class WorkingMemory:
             insort(self._order, self._key(place))
 
     def _key(self, place: int) -> tuple[int, int, int]:
+        """Sort key of a place for transfer: the least weight first, then the earliest entry."""
         return self._weights[place], self._entered[place], place
 
     def _weigh(self, place: int, weight: int) -> None:

@@ -159,7 +159,7 @@ class BevGrid:
         return images
 
     def lowest(self, points: Floats) -> Floats:
-        """(size * size,) least z per cell, m, inf where there is none."""
+        """(size * size,) lowest z of the points in each cell, m, inf in empty cells."""
         cells, inside = self.cells_of(points)
         lowest = np.full(self.size**2, np.inf)
         np.minimum.at(lowest, cells[inside], points[inside, 2])
@@ -171,13 +171,13 @@ class BevGrid:
         return np.column_stack([along[part] for part in np.divmod(cells, self.size)])
 
     def within(self, centre: Floats, radius: float) -> Longs:
-        """Flat cells of a correlation whose shifts lie within `radius` m, or a cell, of `centre` (2,), increasing."""
+        """Flat cells of a correlation, increasing, whose shifts lie within `radius` m, at least one cell, of `centre` (2,), m."""
         along = self._along()
         distances2 = (along[:, None] - centre[0]) ** 2 + (along[None, :] - centre[1]) ** 2
         return np.flatnonzero(distances2 <= max(radius, self.cell) ** 2)
 
     def _along(self) -> Floats:
-        """Shift (size,), m, of row or column k of a correlation."""
+        """Shift (size,), m, that each row or column of a correlation stands for."""
         return np.asarray(np.fft.fftfreq(self.size, 1 / (self.size * self.cell)))
 
 
@@ -242,7 +242,7 @@ class BestShifts:
         bev.improve(flat, self.cells, np.float32(least), np.float32(heading), self.score, self.heading)
 
     def merge(self, other: BestShifts, rows: Longs) -> None:
-        """Take what another one has in the rows (K,) where that is better."""
+        """Take over the scores and headings of the rows (K,) of another object where they are better."""
         score = other.score[rows]
         better = score > self.score
         self.score[better], self.heading[better] = score[better], other.heading[rows[better]]

@@ -60,7 +60,7 @@ def _unit_columns(images: Images) -> tuple[Images, Bools]:
 
 
 def create(config: LoopsConfig) -> PlaceIndex:
-    """The descriptor, empty."""
+    """An empty index of Scan Context descriptors, as configured."""
     return PlaceIndex()
 
 

@@ -88,7 +88,10 @@ def _grid(far: float) -> BevGrid:
 
 
 def _pose(grid: BevGrid, a: LevelSubmap, b: LevelSubmap, shift: Floats, yaw: float, expected_z: float) -> Floats:
-    """(4, 4) with the median height difference of the ground in common; `expected_z` without any."""
+    """Initial guess T_a_b (4, 4) by `shift` (2,), m, and `yaw`, rad; z by the median height difference of common ground.
+
+    expected_z : m, z without ground in common
+    """
     R = so3.exp(np.array([0.0, 0.0, yaw]))
     low_a, low_b = grid.lowest(a.ground), grid.lowest(b.ground @ R.T + np.array([*shift, 0.0]))
     both = np.isfinite(low_a) & np.isfinite(low_b)
@@ -134,10 +137,11 @@ class SubmapRegistration:
         return self._solve(b.source, start, Annealing(self.registration.kernel_max, self.config.max_iterations))
 
     def match(self, b: LevelSubmap, T_a_b: Floats) -> RegistrationResult:
-        """The residuals of b at a pose, within `JUDGED` m."""
+        """Inliers and rmse of b at the pose T_a_b (4, 4), within `JUDGED` m."""
         return self._solve(b.source, T_a_b, Annealing.once(JUDGED))
 
     def _try(self, b: LevelSubmap, guess: Floats, cells: VisibleCells) -> Trial:
+        """Register a few points of b from an initial guess T_a_b (4, 4), coarse to fine, and score the result."""
         r, few = self.registration, thin(b.source, FEW)
         slow = Annealing(CATCH, self.config.max_iterations, r.kernel_max / 2, COARSE_DECAY)
         coarse = self._solve(few, guess, slow, self.a.coarse)
@@ -173,7 +177,7 @@ class Verification:
     overlap: float = float("nan")
 
     def reject(self, stage: LoopStage, reason: str) -> Verification:
-        """The same, with the stage and the reason of a rejection."""
+        """The verification as a rejection, with its stage and reason."""
         return replace(self, stage=stage, reason=reason)
 
 

@@ -252,7 +252,10 @@ class OsmConfig(Section):
 
     @property
     def of_one_building(self) -> OsmConfig:
-        """The section as the match of a single building takes it: `building_weights`, `building_max_distance`."""
+        """The section with `building_weights` and `building_max_distance` in place of those for all buildings.
+
+        The match of a single building (Del Tufo's local match) takes these.
+        """
         farthest = self.max_distance if self.building_max_distance is None else self.building_max_distance
         return self.model_copy(update={"weights": self.building_weights or self.weights, "max_distance": farthest})
 
@@ -263,6 +266,7 @@ class OsmConfig(Section):
 
     @model_validator(mode="after")
     def _check(self) -> OsmConfig:
+        """Raise ValueError for radii in the wrong order."""
         self.require_order("renew_radius", "fetch_radius")
         if not self.use_radius < self.fetch_radius:
             raise ValueError(f"use_radius = {self.use_radius} must be less than fetch_radius = {self.fetch_radius}")

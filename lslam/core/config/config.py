@@ -95,6 +95,7 @@ def read_preset(name: str) -> dict[str, Any]:
 
 
 def _presets() -> dict[str, str]:
+    """TOML text of the presets that ship with lslam, by name."""
     return read_package_files("lslam.core.config", "presets")
 
 
@@ -138,7 +139,7 @@ def load_config(
 
 
 def check_settings(settings: Iterable[str]) -> None:
-    """Raise ConfigError for one ("a.b=v") that names no key; whether its value will do, `load_config` says."""
+    """Raise ConfigError for a setting ("a.b=v") that names no key. Values are checked by `load_config`."""
     for setting in settings:
         _merge({}, _parse_setting(setting), f"--set {setting}")
 
@@ -190,6 +191,7 @@ def to_described_toml(config: Config) -> str:
 
 
 def _inline(value: Any) -> str:
+    """A value as TOML on one line."""
     if isinstance(value, list):
         return f"[{', '.join(_inline(v) for v in value)}]"
     return toml_text({"v": value}).removeprefix("v = ").strip()
@@ -208,6 +210,7 @@ def _from_environment(environ: Mapping[str, str]) -> Tree:
 
 
 def _parse_setting(setting: str) -> Tree:
+    """Tree of one setting "section.key=value"; raises ConfigError for text of another form."""
     name, equals, value = setting.partition("=")
     section, dot, key = name.strip().partition(".")
     if not equals or not dot:
@@ -254,7 +257,10 @@ def former_keys() -> dict[str, dict[str, dict[str, Any]]]:
 
 
 def _outcome(outcome: str = "", value: Any = None, instead: str = "") -> str:
-    """What became of a key of an earlier version, and what to do."""
+    """Sentence for users: what became of a key of an earlier version, and what to do instead.
+
+    outcome : the whole sentence, if given; value : that the key has in all runs now; instead : the setting that replaces it
+    """
     way_out = f"turn {instead} instead" if instead else "leave the key out"
     return outcome or f"it is {value} in all runs; {way_out}"
 

@@ -42,7 +42,7 @@ class ScanRange(Section):
 
     @property
     def own(self) -> dict[str, int]:
-        """What is given, by key of the section `input`.
+        """The numbers that are set, by key of the section `input`.
 
         >>> ScanRange(count=5).own
         {'count': 5}
@@ -91,6 +91,7 @@ class InputConfig(Section):
     @field_validator("rings")
     @classmethod
     def _check_rings(cls, value: str) -> str:
+        """Raise ValueError for a value of `input.rings` that names no rule."""
         if RINGS.fullmatch(value) is None:
             raise ValueError("auto, field, order, rows[:N] or elevation[:N] is needed")
         return value

@@ -141,7 +141,10 @@ NO_RECOVERY = RecoveryConfig(
 
 
 def rest_alone(recovery: RecoveryConfig) -> RecoveryConfig:
-    """No policy but `at_rest`, as configured: for a filter, whose IMU measures the same at rest and in steady motion."""
+    """The section with all recovery policies off but `at_rest`, as configured.
+
+    A filter needs that one: its IMU measures the same at rest and in steady motion.
+    """
     return NO_RECOVERY.model_copy(update={"at_rest": recovery.at_rest})
 
 

@@ -255,6 +255,7 @@ class StudyConfig(Section):
     @field_validator("seeds")
     @classmethod
     def _differ(cls, seeds: tuple[int, ...]) -> tuple[int, ...]:
+        """Raise ValueError for duplicate or negative seeds."""
         return distinct_seeds(seeds)
 
     @field_validator("finding")
@@ -277,6 +278,7 @@ class StudyConfig(Section):
 
     @model_validator(mode="after")
     def _ends(self) -> StudyConfig:
+        """Raise ValueError for a study of too many combinations of parameters."""
         counts = [len(v.values() if isinstance(v, Range) else v) for v in self.parameters.values()]
         count = sum(counts) if self.grid == "one-way" else math.prod(counts)
         if count > MOST_POINTS:
@@ -315,7 +317,7 @@ def parse_study(tree: dict[str, Any], where: str, name: str) -> StudyConfig:
 
 
 def tables(value: Any) -> Sequence[dict[str, Any]]:
-    """Those in a list; what is none is said when it is validated."""
+    """The tables (dictionaries) in a list, empty for another value. Other items are left to validation, which reports them."""
     return [item for item in value if isinstance(item, dict)] if isinstance(value, list) else []
 
 
@@ -340,13 +342,14 @@ class BatchJob(Section):
     @field_validator("sequences", mode="before")
     @classmethod
     def _name(cls, sequences: Any) -> Any:
-        """A word is a recording."""
+        """Turn a text in the list of sequences into the table of a recording with that path."""
         is_list = isinstance(sequences, (list, tuple))
         return [{"path": s} if isinstance(s, str) else s for s in sequences] if is_list else sequences
 
     @field_validator("seeds")
     @classmethod
     def _differ(cls, seeds: tuple[int, ...]) -> tuple[int, ...]:
+        """Raise ValueError for duplicate or negative seeds."""
         return distinct_seeds(seeds)
 
 

@@ -99,7 +99,7 @@ def crs_of(epsg: int, height_epsg: int | None = None) -> Any:
 
 
 def has_heights(crs: Any) -> bool:
-    """Whether the coordinates have a vertical datum of their own, which takes a geoid."""
+    """Whether a coordinate reference system has a vertical datum of its own, so that heights need a geoid."""
     from pyproj import CRS
 
     return isinstance(crs, CRS) and bool(crs.is_compound)
@@ -182,11 +182,13 @@ def _missing_grids(operations: Any, accuracy: float | None) -> list[str]:
 
 
 def _how_to_get(grids: list[str]) -> str:
+    """The commands that install the grids, for a message."""
     files = " and ".join(f"`pyproj sync --file {grid}`" for grid in grids)
     return f"get it by {files} (or projsync), or let PROJ fetch it with PROJ_NETWORK=ON"
 
 
 def _projection(origin: NDArray[Any]) -> Any:
+    """pyproj's `Proj` of the local frame about `origin`."""
     from pyproj import Proj
 
     return Proj(local_crs(origin))

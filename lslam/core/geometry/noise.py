@@ -16,13 +16,13 @@ from lslam.core.geometry import so3
 
 
 def changes(T: NDArray[Any], after: NDArray[Any]) -> Floats:
-    """(..., 6) d that lead from poses `T` to `after` (..., 4, 4)."""
+    """(..., 6) changes d from poses `T` to `after` (..., 4, 4), world axes, m and rad: t' = t + d[:3], R' = exp(d[3:]) R."""
     turns = so3.log(after[..., :3, :3] @ np.swapaxes(T[..., :3, :3], -1, -2))
     return np.concatenate([after[..., :3, 3] - T[..., :3, 3], turns], axis=-1)
 
 
 def to_body(covariance: NDArray[Any], T: NDArray[Any]) -> Floats:
-    """(..., 6, 6) covariances of poses `T` (..., 4, 4) as gtsam wants them: rotation first, body axes."""
+    """(..., 6, 6) covariances of poses `T` (..., 4, 4) in gtsam's order and axes: rotation first, body axes."""
     J = into_body(T)
     return np.asarray(J @ np.asarray(covariance, np.float64) @ np.swapaxes(J, -1, -2))
 
@@ -34,7 +34,10 @@ def from_body(covariance: NDArray[Any], T: NDArray[Any]) -> Floats:
 
 
 def transport(covariance: NDArray[Any], step: NDArray[Any]) -> Floats:
-    """(..., 6, 6) covariance of a pose, carried to one that is `step` (..., 3), m, further: a turn moves what lies ahead."""
+    """(..., 6, 6) covariance of a pose that is rigidly `step` (..., 3), m, world axes, away from one with `covariance`.
+
+    A rotation error moves what lies ahead.
+    """
     F = np.zeros((*np.asarray(step).shape[:-1], 6, 6))
     F[...] = np.eye(6)
     F[..., :3, 3:] = -so3.hat(step)
@@ -42,7 +45,7 @@ def transport(covariance: NDArray[Any], step: NDArray[Any]) -> Floats:
 
 
 def rotate(covariance: NDArray[Any], R: NDArray[Any]) -> Floats:
-    """(..., 6, 6) covariances with both halves turned by `R` (..., 3, 3), from one frame's axes into another's."""
+    """(..., 6, 6) covariances in other axes: translation and rotation parts are rotated by `R` (..., 3, 3)."""
     R = np.asarray(R, np.float64)
     B = np.zeros((*R.shape[:-2], 6, 6))
     B[..., :3, :3] = B[..., 3:, 3:] = R
@@ -50,7 +53,7 @@ def rotate(covariance: NDArray[Any], R: NDArray[Any]) -> Floats:
 
 
 def into_body(T: NDArray[Any]) -> Floats:
-    """(..., 6, 6) J of poses `T` (..., 4, 4), orthogonal: xi = J d."""
+    """(..., 6, 6) orthogonal matrices J at poses `T` (..., 4, 4) by which gtsam's body twist is xi = J d of a change d."""
     Rt = np.swapaxes(np.asarray(T, np.float64)[..., :3, :3], -1, -2)
     J = np.zeros((*Rt.shape[:-2], 6, 6))
     J[..., :3, 3:] = J[..., 3:, :3] = Rt

@@ -165,7 +165,7 @@ def arctan2(y: Any, x: Any) -> Any:
 
 
 def arctan2_of(y: float, x: float) -> float:
-    """The same operations on plain floats that are not both zero, with the same result."""
+    """`arctan2` of plain floats that are not both zero, with the same bits."""
     angle = _arctangent_of(math.inf if x == 0 else abs(y) / abs(x))
     if math.copysign(1.0, x) < 0:
         angle = math.pi - (angle - 1.2246467991473531772e-16)
@@ -185,7 +185,7 @@ def arccos(x: Any) -> Any:
 
 
 def exp(x: Any) -> Any:
-    """Exponential; float32 in, float32 out."""
+    """e^x of numbers of any shape, with the same bits on every processor; float32 in, float32 out."""
     return _of(x, _exponential)
 
 
@@ -204,11 +204,13 @@ def power(x: Any, exponent: float) -> Any:
 
 
 def _kind_of(x: Any) -> Any:
+    """Floating-point dtype of the result for an argument x: its own, or float64."""
     kind = getattr(x, "dtype", None)
     return kind if kind is not None and np.issubdtype(kind, np.floating) else np.dtype(np.float64)
 
 
 def _of(x: Any, function: Any) -> Any:
+    """Apply a function of float64 arrays to x of any shape; the result has the dtype of x."""
     return function(np.asarray(x, np.float64)).astype(_kind_of(x))[()]
 
 
@@ -252,7 +254,7 @@ def sine_cosine_of(x: float) -> tuple[float, float]:
 
 
 def _reduce(x: Any, turns: Any) -> tuple[Any, Any]:
-    """Remainder of angles, rad, after quarter turns, as the sum of two numbers."""
+    """Remainder of angles x, rad, after so many quarter `turns`, as a sum of two numbers for precision."""
     left = x - turns * _HALF_PI[0]
     step = turns * _HALF_PI[1]
     r = left - step
@@ -260,7 +262,7 @@ def _reduce(x: Any, turns: Any) -> tuple[Any, Any]:
 
 
 def _kernels(r: Any, tail: Any) -> tuple[Any, Any]:
-    """Sine and cosine of r + tail within pi/4 of zero."""
+    """Sine and cosine of r + tail, at most pi/4 in magnitude, by polynomials."""
     z = r * r
     v = z * r
     p = _SINE[1] + z * (_SINE[2] + z * (_SINE[3] + z * (_SINE[4] + z * _SINE[5])))
@@ -303,7 +305,7 @@ def _arctangent_of(x: float) -> float:
 
 
 def _horner(z: Any, coefficients: tuple[float, ...]) -> Any:
-    """z (c0 + z (c1 + ...))."""
+    """The polynomial z (c0 + z (c1 + ...)) by Horner's scheme."""
     p = 0.0 * z
     for coefficient in reversed(coefficients):
         p = z * (coefficient + p)

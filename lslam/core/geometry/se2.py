@@ -16,13 +16,13 @@ def wrap(angle: NDArray[Any] | float) -> Floats:
 
 
 def rotation(yaw: float) -> Floats:
-    """(2, 2) that turns by `yaw`, rad."""
+    """(2, 2) rotation matrix by `yaw`, rad."""
     c, s = np.cos(yaw), np.sin(yaw)
     return np.array([[c, -s], [s, c]])
 
 
 def compose(a: NDArray[Any], b: NDArray[Any]) -> Floats:
-    """Pose `b`, given in the axes of `a`, where `a` is given."""
+    """The pose T_a_b T_b_c of two planar poses: `b`, which is given in the frame of `a`, in the frame in which `a` is given."""
     a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
     c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
     x = a[..., 0] + c * b[..., 0] - s * b[..., 1]
@@ -31,7 +31,7 @@ def compose(a: NDArray[Any], b: NDArray[Any]) -> Floats:
 
 
 def inverse(pose: NDArray[Any]) -> Floats:
-    """The pose that undoes `pose`."""
+    """The inverse pose: that of the reference frame, seen from `pose`."""
     pose = np.asarray(pose, np.float64)
     c, s = np.cos(pose[..., 2]), np.sin(pose[..., 2])
     x, y = pose[..., 0], pose[..., 1]
@@ -39,12 +39,12 @@ def inverse(pose: NDArray[Any]) -> Floats:
 
 
 def relative(a: NDArray[Any], b: NDArray[Any]) -> Floats:
-    """Pose `b` in the axes of `a`."""
+    """Pose `b` in the frame of pose `a`: inverse(a) composed with b."""
     return compose(inverse(a), b)
 
 
 def apply(pose: NDArray[Any], points: NDArray[Any]) -> Floats:
-    """Points (..., 2), m, of the axes of `pose` (3,) where `pose` is given."""
+    """Points (..., 2), m, given in the frame of `pose` (3,), in the frame in which `pose` is given."""
     return np.asarray(np.asarray(points, np.float64) @ rotation(float(pose[2])).T + np.asarray(pose, np.float64)[:2])
 
 

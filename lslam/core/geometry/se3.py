@@ -72,7 +72,7 @@ def apply(T: NDArray[Any], points: NDArray[Any]) -> Floats:
 
 
 def normalise(T: NDArray[Any]) -> Floats:
-    """The same transforms with rotations put back on SO(3)."""
+    """The same transforms with their rotations made orthogonal again (nearest rotation)."""
     T = np.asarray(T, np.float64)
     return make(so3.normalise(T[..., :3, :3]), T[..., :3, 3])
 

@@ -50,7 +50,7 @@ def _exp_of(x: float, y: float, z: float) -> Floats:
 
 
 def polynomial(x: float, y: float, z: float, a: float, b: float) -> Floats:
-    """I + a hat(phi) + b hat(phi)^2 of one vector phi = (x, y, z)."""
+    """I + a hat(phi) + b hat(phi)^2 (3, 3) of one rotation vector phi = (x, y, z)."""
     d = x * x + y * y + z * z
     return np.array(
         [
@@ -80,7 +80,7 @@ def log(R: NDArray[Any]) -> Floats:
 
 
 def _log_of(R: Floats) -> tuple[float, float, float]:
-    """The same operations on plain floats, with the same results: a twentieth of the time for one rotation."""
+    """`log` of one rotation by plain floats, with the same bits, in a twentieth of the time."""
     x, y, z, w = _quaternion_of(R)
     n = math.sqrt(x * x + y * y + z * z)
     scale = 2.0 if n < 1e-9 else 2 * portable.arctan2_of(n, w) / n
@@ -190,7 +190,7 @@ def is_rotation(R: NDArray[Any], tolerance: float) -> Bools:
 
 
 def _is_rotation(R: Floats, tolerance: float) -> bool:
-    """The same comparisons on plain floats."""
+    """`is_rotation` of one matrix by plain floats."""
     a, b, c = R.tolist()
     if not all(abs(x) < 2 for x in (*a, *b, *c)):
         return False
@@ -199,11 +199,12 @@ def _is_rotation(R: Floats, tolerance: float) -> bool:
 
 
 def _gram_less_one(a: list[float], b: list[float], c: list[float]) -> list[list[float]]:
-    """R^T R - I of the rows of R."""
+    """R^T R - I, by the rows a, b, c of R."""
     return [[a[i] * a[j] + b[i] * b[j] + c[i] * c[j] - (1.0 if i == j else 0.0) for j in range(3)] for i in range(3)]
 
 
 def _determinant(a: list[float], b: list[float], c: list[float]) -> float:
+    """Determinant of the matrix with rows a, b, c."""
     return a[0] * (b[1] * c[2] - b[2] * c[1]) - a[1] * (b[0] * c[2] - b[2] * c[0]) + a[2] * (b[0] * c[1] - b[1] * c[0])
 
 
@@ -239,6 +240,7 @@ def _normalise_one(R: Floats) -> Floats:
 
 
 def _nearest(R: Floats) -> Floats:
+    """Nearest rotations to matrices (..., 3, 3), by SVD."""
     u, _, vt = np.linalg.svd(R)
     d = np.sign(np.linalg.det(u @ vt))
     u[..., :, 2] *= d[..., None]

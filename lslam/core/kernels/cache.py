@@ -86,6 +86,6 @@ def kernel_folder() -> Path | None:
 
 
 def is_cold() -> bool:
-    """Whether there is a folder of kernels, and none in it yet."""
+    """Whether the folder of machine code exists and is empty: kernels will have to be compiled."""
     folder = kernel_folder()
     return folder is not None and not any(folder.glob("*/*.nbi"))

@@ -61,7 +61,7 @@ def solve_guarded_step(
 
 @inline
 def mirror(H: Floats) -> None:
-    """The lower triangle from the upper."""
+    """Copy the upper triangle of H (6, 6) into the lower one, in place."""
     for i in range(6):
         for j in range(i):
             H[i, j] = H[j, i]
@@ -125,7 +125,7 @@ def within(projector: Floats, H: Floats) -> Floats:
 
 @inline
 def make_whole(sums: Sums) -> None:
-    """Divide the sums of a linearisation by the mean relative weight of its points, and fill in H's lower triangle."""
+    """Divide the sums of a linearisation by the mean relative weight of its points; fill in H's lower triangle."""
     H, S, g, facts = sums
     if facts[POPULATION] > 0.0:
         scale_by_population(H, S, g, facts)

@@ -44,7 +44,7 @@ USED, FREED, HAND, LIVE = 0, 1, 2, 3
 
 @inline
 def find(key: int, keys: Longs, table: Ints) -> int:
-    """Slot of a key, or -1."""
+    """Slot of the voxel `key`, or -1 if the map has none."""
     return int(table[place_of(key, keys, table)])
 
 

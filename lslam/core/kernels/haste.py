@@ -15,7 +15,7 @@ NEWEST_RELEASE = (0, 68)
 
 
 def hasten() -> None:
-    """Leave that work out from now on, for all functions of this process."""
+    """Leave the needless work out from now on, for all functions that this process compiles."""
     if not fits_release():
         return
     for leave_out in (compare_set_flags, remember_signatures, emit_entry_points, find_lifetimes_late):
@@ -24,12 +24,13 @@ def hasten() -> None:
 
 
 def fits_release() -> bool:
-    """Whether the release of numba is one that this was tried with."""
+    """Whether the installed release of numba is one that these changes were tested with."""
     release: tuple[int, int] = import_module("numba").version_info.short
     return release <= NEWEST_RELEASE
 
 
 def _numba(module: str) -> Any:
+    """Import a module of numba."""
     return import_module(f"numba.{module}")
 
 
@@ -79,6 +80,7 @@ def emit_entry_points() -> None:
 
 
 def _defines(module: Any, name: str) -> bool:
+    """Whether an LLVM module has the body of a function, not only its declaration."""
     try:
         return not module.get_function(name).is_declaration
     except NameError:

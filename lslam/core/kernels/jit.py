@@ -43,15 +43,17 @@ class _OnFirst(event.Listener):
         self._call, self.has_called = call, False
 
     def on_start(self, event: Any) -> None:
+        """Call the function at the first event."""
         if not self.has_called:
             self.has_called = True
             self._call()
 
     def on_end(self, event: Any) -> None:
-        pass
+        """Does nothing; numba's listeners have to have it."""
 
 
 def _hasten() -> None:
+    """Shorten numba's compilation, when something is to be compiled."""
     from lslam.core.kernels.haste import hasten  # with parts of numba that loading kernels does without
 
     hasten()
@@ -126,6 +128,7 @@ def _share(dispatcher: Any) -> None:
 
 
 def _wait_for(locks: contextlib.ExitStack, folder: Path, name: str) -> None:
+    """Take the lock file of kernel `name`, waiting for the process that compiles it; `locks` releases it."""
     import fcntl
 
     folder.mkdir(parents=True, exist_ok=True)
@@ -133,6 +136,7 @@ def _wait_for(locks: contextlib.ExitStack, folder: Path, name: str) -> None:
 
 
 def _tell(name: str, is_ready: bool) -> None:
+    """Report that a kernel is being compiled, or is ready."""
     for call in _when_ready:
         call(name, is_ready)
 
@@ -152,13 +156,14 @@ def inline_with_arrays(function: F) -> F:
 
 
 class _InlineDispatcher(CPUDispatcher):
-    """Function without an entry for Python, where its source runs."""
+    """Compiled function that can be called from kernels only; a call from Python runs its source."""
 
     def __call__(self, *args: Any) -> Any:
         return self.py_func(*args)
 
 
 def _compile_inline(function: F, **more: bool) -> F:
+    """Compile a function for use inside kernels, without an entry point for Python; more : numba's options."""
     options: dict[str, Any] = _OPTIONS | {"forceinline": True, "no_cpython_wrapper": True} | more
     compiled: Any = numba.njit(**options)(function)
     compiled.__class__ = _InlineDispatcher

@@ -313,13 +313,16 @@ def add_information(
 def add_surface(
     S: Floats, rest: Floats, w: float, nx: float, ny: float, nz: float, rx: float, ry: float, rz: float
 ) -> None:
-    """Upper triangle of S (6, 6) += w j j^T with j = [n, r x n]; `rest` (6,) takes no gradient."""
+    """Upper triangle of S (6, 6) += w j j^T with j = [n, r x n]: information w, 1/m2, along the normal n at the point r, m.
+
+    r : seen from the sensor, world axes; rest : (6,) unused gradient
+    """
     add_information(S, rest, w, nx * nx, nx * ny, nx * nz, ny * ny, ny * nz, nz * nz, 0.0, 0.0, 0.0, rx, ry, rz)
 
 
 @inline
 def thin_information(p: Floats, xx: float, xy: float, xz: float, yy: float, yz: float, zz: float) -> float:
-    """n^T M n along the normal of a plane voxel, a row of `planes`."""
+    """Information n^T M n along the unit normal n of a plane voxel; p : its row of `planes`, xx..zz : the symmetric M."""
     nx, ny, nz = p[3], p[4], p[5]
     along: float = xx * nx * nx + yy * ny * ny + zz * nz * nz + 2.0 * (xy * nx * ny + xz * nx * nz + yz * ny * nz)
     return along

@@ -40,7 +40,7 @@ class Footprint:
         return float(sum(_signed_area(ring) for ring in self.rings))
 
     def transform(self, rotation: Floats, shift: Floats) -> Footprint:
-        """Every corner p at `rotation` (2, 2) p + `shift` (2,)."""
+        """The outline with every corner p moved to `rotation` (2, 2) p + `shift` (2,), m."""
         return Footprint(self.outer @ rotation.T + shift, tuple(hole @ rotation.T + shift for hole in self.holes))
 
 
@@ -71,11 +71,11 @@ class Building:
         return np.asarray((corners.min(0) + corners.max(0)) / 2)
 
     def transform(self, rotation: Floats, shift: Floats) -> Building:
-        """Every corner p at `rotation` (2, 2) p + `shift` (2,)."""
+        """The building with every corner p moved to `rotation` (2, 2) p + `shift` (2,), m."""
         return replace(self, footprints=tuple(footprint.transform(rotation, shift) for footprint in self.footprints))
 
     def displace(self, displacement: Floats) -> Building:
-        """Turned by displacement[2], rad, about its middle, then shifted by displacement[:2], m."""
+        """The building rotated by displacement[2], rad, about its middle, then shifted by displacement[:2], m."""
         return self.transform(*about(self.middle, displacement))
 
 
@@ -112,6 +112,7 @@ def footprints_of(geometry: Any) -> tuple[Footprint, ...]:
 
 
 def _signed_area(ring: Floats) -> float:
+    """Signed area, m2, of a ring (K, 2), positive counter-clockwise."""
     x, y = (ring - ring[0]).T
     return float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y) / 2)
 

@@ -66,7 +66,7 @@ class ArrayCloud:
 
     @classmethod
     def of(cls, points: Any, intensity: Any = None) -> ArrayCloud:
-        """From anything array-like."""
+        """A cloud of array-likes: points (N, 3), m, and intensity (N,) or None."""
         values = None if intensity is None else np.asarray(intensity, np.float32).reshape(-1)
         return cls(np.asarray(points, np.float64).reshape(-1, 3), values)
 
@@ -81,7 +81,7 @@ class ArrayCloud:
         return {name: values.dtype for name, values in self.columns.items()}
 
     def select(self, index: NDArray[Any] | slice) -> ArrayCloud:
-        """The points at `index`, with all that is known of them."""
+        """The points at `index`, with their intensity and further columns."""
         intensity = None if self.intensity is None else self.intensity[index]
         return ArrayCloud(self.points[index], intensity, {name: v[index] for name, v in self.columns.items()})
 
@@ -89,7 +89,7 @@ class ArrayCloud:
         return len(self.points)
 
     def blocks(self) -> Iterator[CloudBlock]:
-        """Slices of the arrays."""
+        """The cloud in blocks, which are slices of its arrays."""
         for start in range(0, len(self), BLOCK):
             some = self.select(slice(start, start + BLOCK))
             yield CloudBlock(some.points, some.intensity, some.columns)

@@ -220,16 +220,16 @@ class InertialChain:
 
     @property
     def level(self) -> frozenset[int]:
-        """Keyframes whose tilt is observable by the IMU.
+        """Keyframes whose tilt is observable by the IMU: those of links that meet another link.
 
-        A link by itself tells of none: the velocities at its ends are free, and take up whatever gravity is said to be.
+        In a single link the velocities at both ends are free, and fit any direction of gravity.
         """
         joints = {link.a for link in self.links} & {link.b for link in self.links}
         known = [(link.a, link.b) for link in self.links if not joints.isdisjoint((link.a, link.b))]
         return frozenset(k for ends in known for k in ends)
 
     def until(self, count: int) -> InertialChain | None:
-        """That of the first `count` keyframes; None without a link."""
+        """The chain of the first `count` keyframes; None without a link among them."""
         links = [link for link in self.links if max(link.a, link.b) < count]
         return replace(self, links=links) if links else None
 

@@ -25,7 +25,7 @@ class StageClock:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Measure the block."""
+        """Add the time that the block takes to the stage `name`."""
         began = time.perf_counter()
         try:
             yield
@@ -127,7 +127,7 @@ class MotionCheck:
 
 
 def motion_apart(a: Floats, b: Floats) -> Floats:
-    """(6,) by how much a motion `b` (4, 4) is more than another, `a`: m, then rad, in the axes of where both begin."""
+    """(6,) difference of the motion `b` (4, 4) from the motion `a` (4, 4): m, then rad, in the axes where both begin."""
     turn = so3.log(portable.product(b[:3, :3], a[:3, :3].T))
     return np.concatenate([b[:3, 3] - a[:3, 3], turn])
 
@@ -220,13 +220,13 @@ class ScanResult:
 
     @property
     def by_points(self) -> ScanResult:
-        """The same pose, which varies as the local map does by the points alone; the result itself where that is all there is."""
+        """The result with `points_covariance` as its covariance, without the IMU's part; itself without such a covariance."""
         if self.points_covariance is None:
             return self
         return replace(self, covariance=self.points_covariance, registration_covariance=None)
 
     def poser(self, method: str) -> str:
-        """What posed the scan: the `method`, its fallback, the motion prior, or the scan before where it repeats that pose."""
+        """Name of what determined the pose: the `method`, its fallback, the motion prior, or the pose of the scan before."""
         if self.repeats_pose:
             return STATIONARY
         return (self.posed_by or method) if self.status == "ok" else MOTION_PRIOR

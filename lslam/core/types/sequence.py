@@ -168,7 +168,7 @@ class SequenceView(Scans):
         return len(self.whole)
 
     def scan(self, index: int) -> Scan:
-        """Scan `index` of the whole. Raises InputError as it does."""
+        """Read scan `index` of the whole sequence. Raises InputError as it does."""
         return self.whole.scan(index)
 
 

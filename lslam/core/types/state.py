@@ -19,7 +19,7 @@ class Stateful:
     TRANSIENT: ClassVar[tuple[str, ...]] = ()
 
     def state(self) -> State:
-        """What `restore` needs to go on from here."""
+        """The values of the attributes in `STATE`, for a checkpoint."""
         return {name: _state_of(getattr(self, name)) for name in self.STATE}
 
     def restore(self, state: State) -> None:
@@ -35,4 +35,5 @@ class Stateful:
 
 
 def _state_of(value: Any) -> Any:
+    """The state of an object that has one, any other value itself."""
     return value.state() if isinstance(value, Stateful) else value

@@ -89,7 +89,7 @@ class StudyRow:
 
 
 def series_of(method: str, uses_imu: bool) -> str:
-    """A method as people read it.
+    """Label of a method in tables and plots: its name, with `+imu` if it uses the IMU.
 
     >>> series_of("icp", uses_imu=True)
     'icp+imu'
@@ -173,7 +173,7 @@ class Curve:
         )
 
     def name_of(self, value: float) -> str:
-        """A value of the parameter for people."""
+        """Text for a value of the parameter: its word, or the number."""
         return self.words[int(value)] if self.words else f"{value:g}"
 
 

@@ -48,12 +48,12 @@ class Warnings(logging.Filter):
         return said
 
     def state(self) -> State:
-        """What `take_over` needs."""
+        """The warnings so far, for `take_over` in a resumed run."""
         places = dict(self._places)
         return {"texts": list(places), "places": list(places.values())}
 
     def take_over(self, state: State) -> None:
-        """Add what an earlier part of the run was warned of."""
+        """Add the warnings of an earlier part of the run, from its `state`."""
         for text, place in zip(state["texts"], state["places"], strict=True):
             self._places.setdefault(text, place)
 
@@ -62,7 +62,7 @@ _collector: ContextVar[Warnings | None] = ContextVar("lslam_warnings", default=N
 
 
 def warnings_so_far() -> Warnings:
-    """Those of the run in whose context this is; where there is none, some that nobody looks at."""
+    """The warnings of the run in this context; outside of a run an empty collection that nobody reads."""
     return _collector.get() or Warnings()
 
 
@@ -88,10 +88,12 @@ def collect_warnings() -> Iterator[Warnings]:
 
 
 def _repeats(text: str, messages: Collection[str]) -> bool:
+    """Whether one of the messages is contained in `text`."""
     return any(sentence and sentence in text for sentence in messages)
 
 
 def _text(record: logging.LogRecord) -> str:
+    """The message of a log record; unformatted if its arguments do not fit."""
     try:
         return record.getMessage()
     except (TypeError, ValueError):  # of a method of somebody else's: no reason to end a run

@@ -153,6 +153,7 @@ class ChunkFile:
         return data
 
     def _read(self, position: int, size: int) -> bytes:
+        """Read `size` bytes from `position` of the file on disk or in storage, fewer at its end."""
         if self._ranged:
             return self._ranged.read(position, size)
         assert self._file is not None

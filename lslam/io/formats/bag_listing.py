@@ -110,6 +110,7 @@ def stem_of(path: Path) -> str:
 
 
 def _unpack_name(name: str) -> str:
+    """The name without the suffix of a compression of the whole file."""
     ending = next((e for e in COMPRESSIONS if name.lower().endswith(e)), "")
     return name[: len(name) - len(ending)]
 

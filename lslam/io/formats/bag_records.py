@@ -143,7 +143,7 @@ class ChunkedBag(ABC):
         """An empty topic for each channel whose name is known."""
 
     def _beside_messages(self) -> Iterator[tuple[int, int]]:
-        """Positions and sizes of the records between the chunks, as the summary states them: the walk will read these."""
+        """Positions and sizes of the records between the chunks, by the summary: those that `_walk` will read."""
         position, size = self._summary(), self._file.size
         self._file.expect(lambda: [(position, size - position)] if position else [])
         while 0 < position < size:
@@ -198,6 +198,7 @@ class ChunkedBag(ABC):
         return chunk.position + self._index_by_hand(self._add_chunk(replace(chunk, size=left, length=left)))
 
     def _add_chunk(self, chunk: Chunk) -> int:
+        """Add a chunk and return its number. Raises InputError for an unknown compression."""
         if chunk.compression not in _COMPRESSIONS:
             known = "bz2, lz4 and zstd are"
             raise InputError(f"{self.path}: compression {chunk.compression!r} of its chunks is not known: {known}")

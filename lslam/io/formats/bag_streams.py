@@ -178,6 +178,7 @@ def stamp_of(message: Any) -> int:
 
 
 def _numbers(topic: BagTopic, p: Any, q: Any) -> list[float]:
+    """Position and quaternion (7,) of a pose message; raises InputError where they are not finite."""
     row = [p.x, p.y, p.z, q.x, q.y, q.z, q.w]
     if not all(abs(v) < _LARGEST for v in row):
         raise InputError(f"a message of {topic.name} holds no pose: {row}")
@@ -185,6 +186,7 @@ def _numbers(topic: BagTopic, p: Any, q: Any) -> list[float]:
 
 
 def _poses(table: Floats) -> Floats:
+    """Poses (N, 4, 4) of positions and quaternions (N, 7); a zero quaternion, of an unknown rotation, gives the identity."""
     length = np.linalg.norm(table[:, 3:], axis=1, keepdims=True)
     # Drivers publish (0, 0, 0, 0) where they do not know a rotation.
     quaternions = np.where(length > 0, table[:, 3:] / np.where(length > 0, length, 1), [0.0, 0.0, 0.0, 1.0])

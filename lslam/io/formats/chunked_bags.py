@@ -39,6 +39,7 @@ class Ros1Bag(ChunkedBag):
         super().__init__(path, copy)
 
     def _misnomer(self, head: bytes) -> str:
+        """Reason, for a message, why a file with these first bytes is none of this format."""
         is_old = head.startswith(b"#ROSBAG")
         return "an old version, `rosbag fix` brings it to 2.0" if is_old else "no ROS 1 bag"
 
@@ -53,32 +54,39 @@ class Ros1Bag(ChunkedBag):
         return Record(fields[b"op"][0], fields, offset + length + 8, size)
 
     def _summary(self) -> int:
+        """Position of the summary in the file; 0 without one."""
         return _number(self._record(None, len(self.MAGIC)).head[b"index_pos"])
 
     def _near(self, info: Record) -> list[tuple[int, int]]:
         # Before a chunk lie the indices of the one before.
+        """Ranges (position, size) to read about a chunk: its head and the indices beside it; info : its record in the summary."""
         return [(_number(info.head[b"chunk_pos"]) - INDICES, INDICES + _HEADER)]
 
     def _chunk(self, record: Record) -> Chunk:
+        """The chunk that a chunk record describes."""
         compression = record.head[b"compression"].decode(errors="replace").replace("none", "")
         return Chunk(record.data, record.size, _number(record.head[b"size"]), compression)
 
     def _index(self, record: Record) -> tuple[int, NDArray[np.unsignedinteger[Any]]]:
+        """Channel of an index record, and stamps (ns) and offsets (N, 2) of its messages."""
         entries = np.frombuffer(self._file.read(record.data, record.size), "<u4").reshape(-1, 3).astype(np.uint64)
         stamps = entries[:, 0] * 10**9 + entries[:, 1]
         return _number(record.head[b"conn"]), np.column_stack([stamps, entries[:, 2]])
 
     def _message(self, record: Record) -> tuple[int, int]:
+        """Channel and stamp (ns) of a message record."""
         seconds, nanoseconds = struct.unpack("<II", record.head[b"time"])
         return _number(record.head[b"conn"]), seconds * 10**9 + nanoseconds
 
     def _note_name(self, record: Record, data: bytes) -> None:
+        """Store the topic of a connection record under its number."""
         package, _, name = _fields(data).get(b"type", b"").decode(errors="replace").partition("/")
         kind = f"{package}/msg/{name}" if name else ""
         topic = Topic(record.head[b"topic"].decode(errors="replace"), kind, "ros1")
         self._connections.setdefault(_number(record.head[b"conn"]), topic)
 
     def _empty_topics(self) -> dict[int, Topic]:
+        """Topics by channel, their messages not added yet."""
         return self._connections
 
 
@@ -112,23 +120,28 @@ class McapFile(ChunkedBag):
         super().__init__(path, copy)
 
     def _misnomer(self, head: bytes) -> str:
+        """Reason, for a message, why a file with these first bytes is none of this format."""
         return "no MCAP file"
 
     def _record(self, chunk: Chunk | None, offset: int, is_head: bool = False) -> Record:
+        """The record at `offset` of a chunk (None: of the file); is_head : only the beginnings of messages will be read."""
         head = self._file.part(chunk, offset, _PREFIX + _STAMPS, is_head)
         op, length = struct.unpack_from("<BQ", head)
         before = _STAMPS if op == self.MESSAGE else 0
         return Record(op, head[_PREFIX:], offset + _PREFIX + before, length - before)
 
     def _summary(self) -> int:
+        """Position of the summary in the file; 0 without one."""
         footer = self._file.size - len(self.MAGIC) - _FOOTER_SIZE
         return int(struct.unpack_from("<Q", self._file.read(footer, _FOOTER_SIZE), _PREFIX)[0])
 
     def _near(self, info: Record) -> list[tuple[int, int]]:
+        """Ranges (position, size) to read about a chunk: its head and the indices behind it; info : its record in the summary."""
         start, size = struct.unpack_from("<2Q", self._file.read(info.data, info.size), 16)
         return [(start, _CHUNK_HEAD), (start + size, INDICES)]
 
     def _chunk(self, record: Record) -> Chunk:
+        """The chunk that a chunk record describes."""
         head = self._file.part(None, record.data, _CHUNK_HEAD)
         _, _, length, crc = struct.unpack_from("<QQQI", head)
         compression, at = _text(head, 28)
@@ -136,10 +149,12 @@ class McapFile(ChunkedBag):
         return Chunk(record.data + at + 8, size, length, compression, crc)
 
     def _index(self, record: Record) -> tuple[int, NDArray[np.unsignedinteger[Any]]]:
+        """Channel of an index record, and stamps (ns) and offsets (N, 2) of its messages."""
         data = self._file.read(record.data, record.size)
         return int.from_bytes(data[:2], "little"), np.frombuffer(data, "<u8", offset=6).reshape(-1, 2)
 
     def _message(self, record: Record) -> tuple[int, int]:
+        """Channel and stamp (ns) of a message record."""
         channel, _, stamp = struct.unpack_from("<HIQ", record.head)
         return channel, stamp
 
@@ -154,6 +169,7 @@ class McapFile(ChunkedBag):
         self._channels[number] = (schema, name, _text(data, at)[0])
 
     def _empty_topics(self) -> dict[int, Topic]:
+        """Topics by channel, their messages not added yet."""
         return {
             channel: Topic(name, _type(self._schemas.get(schema, "")), encoding)
             for channel, (schema, name, encoding) in self._channels.items()
@@ -166,6 +182,7 @@ def _type(name: str) -> str:
 
 
 def _text(data: bytes, at: int) -> tuple[str, int]:
+    """A text preceded by its length, at byte `at`, and the byte behind it."""
     (length,) = struct.unpack_from("<I", data, at)
     end = at + 4 + length
     return data[at + 4 : end].decode(errors="replace"), end

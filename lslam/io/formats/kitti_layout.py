@@ -220,6 +220,7 @@ def read_entries(path: Path) -> dict[str, str]:
 
 
 def _tr(path: Path, entries: dict[str, str]) -> Floats | None:
+    """Transform (4, 4) from the LiDAR to camera 0 among a calibration's entries; None without one."""
     for name in LIDAR_TO_CAMERA:
         if name in entries:
             rows = _entry(path, entries, name, 12).reshape(3, 4)
@@ -304,6 +305,7 @@ def _transform_in_file(path: Path) -> Floats:
 
 
 def _words(text: str) -> list[str]:
+    """The text split at commas, semicolons, brackets and blanks."""
     return re.findall(r"[^,;\s\[\]]+", text)
 
 

@@ -162,6 +162,7 @@ def _check_chunks(stream: BinaryIO, laszip: lazrs.LazVlr, layers: int, count: in
 
 
 def _check_layers(stream: BinaryIO, layers: int, begin: int, length: int, record: int) -> None:
+    """Raise ValueError if a chunk's `length`, bytes, at `begin` is too short for its layers."""
     stream.seek(begin + record)
     need = 4 + 4 * layers
     said = stream.read(need) if record + need <= length else b""

@@ -123,9 +123,11 @@ class _Positions:
         return float(np.min(np.nan_to_num(np.linalg.norm(self.xy, axis=1), nan=np.inf)))
 
     def has(self, nodes: Iterable[int]) -> bool:
+        """Whether all nodes have positions."""
         return all(node in self.row for node in nodes)
 
     def ring(self, nodes: Sequence[int]) -> Floats:
+        """Corners (K, 2), m, of a closed ring of nodes, the first not repeated."""
         return np.asarray(self.xy[[self.row[node] for node in nodes[:-1]]])
 
 
@@ -177,6 +179,7 @@ def _relation_footprints(
 
 
 def _building(osm_id: str, footprints: tuple[Footprint, ...], tags: Mapping[str, str]) -> Building:
+    """The building of these footprints, with heights and tags by its element's `tags`."""
     own = {key: value for key, value in tags.items() if key != "type"}
     return Building(osm_id, footprints, height_of(tags), base_of(tags), own)
 
@@ -228,6 +231,7 @@ def is_underground(tags: Mapping[str, str]) -> bool:
 
 
 def _number(text: str) -> float | None:
+    """The decimal number that a text is; None for other texts."""
     match = re.fullmatch(r"\s*([+-]?\d+(?:[.,]\d+)?)\s*", text)
     return float(match[1].replace(",", ".")) if match else None
 

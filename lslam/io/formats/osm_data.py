@@ -180,6 +180,7 @@ class AreaMaker:
         return number
 
     def _node(self, place: Place) -> int:
+        """Number of the node at a place, added unless nodes are shared and it exists."""
         if not self._shares_nodes or place not in self._at:
             self._at[place] = next(self._numbers)
             self._data.add_node(self._at[place], *place)

@@ -192,15 +192,18 @@ def _xml_lines(data: OsmData) -> Iterator[str]:
 
 
 def _identity(data: OsmData, kind: str, number: int) -> str:
+    """XML attributes of an element: id, version, and the mark of an edited one."""
     action = ' action="modify"' if (kind, number) in data.edits else ""
     return f'id="{number}" version="{data.versions.get((kind, number), 1)}"{action}'
 
 
 def _tag_lines(tags: Iterable[tuple[str, str]]) -> Iterator[str]:
+    """XML lines of tags."""
     return (f"  <tag k={_quote(key)} v={_quote(value)}/>\n" for key, value in tags)
 
 
 def _quote(text: str) -> str:
+    """A text as a quoted XML attribute, without control characters, which XML cannot hold."""
     from xml.sax.saxutils import quoteattr  # with what speaks to servers
 
     # XML has no way to write most control characters.
@@ -235,6 +238,7 @@ def osm_from_outlines(tree: Any) -> OsmData:
 
 
 def _places(ring: Any) -> list[Place]:
+    """Positions (lat, lon) of a GeoJSON ring; raises ValueError for fewer than four."""
     if not isinstance(ring, list) or len(ring) < 4:
         raise ValueError("a ring of a polygon has fewer than four positions")
     return [_place(position) for position in ring]
@@ -284,6 +288,7 @@ def _identifier(properties: dict[str, Any], name: Any) -> tuple[str, int] | None
 
 
 def _tags(properties: dict[str, Any]) -> dict[str, str]:
+    """Tags of GeoJSON properties, as texts; those in a table `tags` too."""
     held = properties.get("tags")
     flat = {**properties, **(held if isinstance(held, dict) else {})}
     return {str(k): str(v) for k, v in flat.items() if isinstance(v, str | int | float) and not str(k).startswith("@")}

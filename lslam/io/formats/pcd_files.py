@@ -30,6 +30,8 @@ _KEYS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWP
 
 @dataclass(frozen=True)
 class _Header:
+    """Header of a PCD file."""
+
     names: list[str]
     dtype: np.dtype[Any]  # of one point, its fields numbered; those that repeat are arrays
     points: int
@@ -137,6 +139,7 @@ def _check_header(path: Path, entries: dict[str, list[str]], size: int) -> _Head
 
 
 def _number(path: Path, key: str, *words: str) -> int:
+    """The whole number of a header line; raises InputError naming the key for anything else."""
     value = whole_number(words[0]) if len(words) == 1 else None
     if value is None:
         raise InputError(f"{path}: PCD {key} {' '.join(words)!r} is no whole number")

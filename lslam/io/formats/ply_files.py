@@ -39,6 +39,8 @@ _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 @dataclass
 class _Element:
+    """One element of a PLY header, such as `vertex`: its name, number of rows and properties."""
+
     name: str
     count: int
     properties: list[tuple[str, str]]  # name, numpy code; code "list" for lists

@@ -274,6 +274,7 @@ def plain_name(name: str) -> str:
 
 
 def _first(names: Mapping[str, str], plain_names: tuple[str, ...]) -> str | None:
+    """The name of the first of `plain_names` among the keys of `names`; None without any."""
     return next((names[plain] for plain in plain_names if plain in names), None)
 
 

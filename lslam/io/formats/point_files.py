@@ -101,6 +101,7 @@ def record_of(files: Mapping[Path, NDArray[np.uint8]]) -> tuple[PointRecord, str
 
 
 def _other_sizes(size: int, record: PointRecord) -> str:
+    """Other point sizes, bytes, that divide the size of a file, for a message."""
     sizes = [str(k) for k in range(12, 65) if k != record.size and size % k == 0]
     return ", ".join(sizes) or "another number of"
 
@@ -355,6 +356,7 @@ class MapCloud:
         self.column_types = {name: kind for name, kind in known[0].items() if all(name in one for one in known)}
 
     def _parts(self) -> Iterator[Cloud]:
+        """The clouds of the files, each opened in its turn."""
         return (open_map(path, self._attributes) for path in self._paths)
 
     def __len__(self) -> int:

@@ -222,7 +222,7 @@ def _unlikely(scans: list[Floats]) -> str:
 
 
 def _depends_on_row(columns: list[Floats], period: int) -> bool:
-    """Whether every `period`-th value differs from the others in magnitude or sign; False for too few to tell."""
+    """Whether every `period`-th value differs from the others in magnitude or sign; False where too few values tell."""
     parts = [np.concatenate([column[k::period] for column in columns]) for k in range(period)]
     least = min(len(part) for part in parts)
     if least < _MIN_POINTS:

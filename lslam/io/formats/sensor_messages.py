@@ -101,10 +101,12 @@ def _dtype(message: Any, where: Path) -> np.dtype[Any]:
 
 
 def _native(values: NDArray[Any]) -> NDArray[Any]:
+    """The values in the machine's byte order."""
     return values.astype(values.dtype.newbyteorder("="), copy=False)
 
 
 def _finite(cloud: PointCloud) -> PointCloud:
+    """The cloud without points that are not finite."""
     finite = np.asarray(np.isfinite(cloud.points).all(axis=1))
     return cloud if finite.all() else cloud.select(finite)
 

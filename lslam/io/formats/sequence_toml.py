@@ -38,14 +38,17 @@ def is_rate(rate_hz: float) -> bool:
 
 
 def _is_text(value: Any) -> bool:
+    """Whether a value is a text that is not blank."""
     return isinstance(value, str) and bool(value.strip())
 
 
 def _is_number(value: Any) -> bool:
+    """Whether a value is a finite number."""
     return isinstance(value, (int, float)) and not isinstance(value, bool) and bool(np.isfinite(value))
 
 
 def _is_record(value: Any) -> bool:
+    """Whether a value is a valid point record, see `parse_record`."""
     try:
         return isinstance(value, str) and bool(parse_record(value))
     except ValueError:
@@ -58,14 +61,17 @@ def _key(is_valid: Callable[[Any], bool], form: str) -> Any:
 
 
 def _text(form: str) -> Any:
+    """Field of `SequenceInfo` whose value is a text; form : of that text, for messages."""
     return _key(_is_text, form)
 
 
 def _count() -> Any:
+    """Field of `SequenceInfo` whose value is a whole number above 0."""
     return _key(lambda v: isinstance(v, int) and not isinstance(v, bool) and v > 0, "a whole number above 0")
 
 
 def _one_of(choices: Iterable[str]) -> Any:
+    """Field of `SequenceInfo` whose value is one of the choices."""
     names = list(choices)
     return _key(lambda v: v in names, f"one of {', '.join(names)}")
 

@@ -63,11 +63,13 @@ def read_npz(source: Path | BinaryIO) -> dict[str, NDArray[Any]]:
 
 
 def _array(member: bytes) -> NDArray[Any]:
+    """The array in a member of an .npz file; raises ValueError for one that would need pickle."""
     with HEADERS:
         return np.asarray(np.lib.format.read_array(io.BytesIO(member), allow_pickle=False))
 
 
 def _name(source: Path | BinaryIO) -> str:
+    """Name of a source in messages."""
     return str(source) if isinstance(source, Path) else "an archive"
 
 
@@ -134,6 +136,7 @@ def _decode(tree: Any, arrays: Arrays, classes: Classes) -> Any:
 
 
 def _encode_records(rows: Sequence[Any], arrays: Arrays) -> Any:
+    """JSON tree of instances of one dataclass, column by column, with their arrays moved to `arrays`."""
     if not rows:
         return {"class": "", "count": 0, "columns": {}}
     columns = {f.name: _encode_column([getattr(row, f.name) for row in rows], arrays) for f in fields(rows[0])}
@@ -141,6 +144,7 @@ def _encode_records(rows: Sequence[Any], arrays: Arrays) -> Any:
 
 
 def _decode_records(tree: Any, arrays: Arrays, classes: Classes) -> list[Any]:
+    """The instances that `_encode_records` turned into `tree` and `arrays`; classes : dataclasses by name."""
     if not tree["count"]:
         return []
     columns = {name: _decode_column(column, arrays, classes) for name, column in tree["columns"].items()}

@@ -202,9 +202,10 @@ def poses_of(values: Floats, table: TextTable) -> tuple[Floats, bool, list[str]]
 
 
 class PoseColumns(NamedTuple):
-    """columns : of x, y, z and, where there are rotations, qx, qy, qz, qw; leading : the number of columns before, by place
+    """Columns of poses in a table.
 
-    notes : what was chosen
+    columns : of x, y, z and, where there are rotations, qx, qy, qz, qw
+    leading : number of columns before, in a table without names; notes : what was chosen
     """
 
     columns: list[int]

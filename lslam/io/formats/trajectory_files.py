@@ -58,6 +58,7 @@ class TrajectoryFormat:
         return self._function("write")
 
     def _function(self, verb: str) -> Callable[..., Any]:
+        """Function of the format's module: `verb` is fits, read or write."""
         function: Callable[..., Any] = getattr(import_module(self.module), f"{verb}_{self.name}")
         return function
 

@@ -181,4 +181,5 @@ def write_g2o(path: Path, poses: Floats, constraints: Sequence[Constraint]) -> N
 
 
 def _pose_text(T: Floats) -> str:
+    """Position and quaternion xyzw of a pose (4, 4), with blanks between."""
     return " ".join(f"{v:.12g}" for v in (*T[:3, 3], *so3.to_quaternion(T[:3, :3])))

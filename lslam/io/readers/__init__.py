@@ -169,6 +169,7 @@ def _open(folder: Path, overrides: SequenceInfo) -> Sequence:
 
 
 def _opened_by(reader: Any, folder: Path, overrides: SequenceInfo) -> Sequence | None:
+    """The folder opened by the reader; None if the reader does not accept it."""
     located = reader.locate(folder)
     return None if located is None else reader.open_folder(located[0], overrides, located[1])
 
@@ -244,6 +245,7 @@ def sequence_number(name: str) -> str:
 
 
 def _sequences(root: Path, text: str) -> list[Path]:
+    """The KITTI odometry sequence below `root` that the text names, in a list; empty without one."""
     number = sequence_number(text)
     if not number:
         return []
@@ -265,6 +267,7 @@ def _drives(root: Path, text: str) -> list[Path]:
 
 
 def _all_drives(root: Path) -> list[Path]:
+    """All KITTI raw drives below `root`, sorted."""
     places = [root, *(p for part in _ROOTS if (p := root / part).is_dir() and part)]
     days = [d for place in places for d in place.glob("[0-9]*_[0-9]*_[0-9]*") if d.is_dir()]
     candidates = [p for place in [*places, *days] for p in place.glob("*_drive_*") if p.is_dir()]

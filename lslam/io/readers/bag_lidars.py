@@ -293,7 +293,7 @@ class Links:
 
     @cached_property
     def _still(self) -> Transforms:
-        """Transforms of /tf_static, and those of /tf that are repeated without a change."""
+        """Transforms that do not change: those of /tf_static, and those of /tf whose repetitions are equal."""
         same = {pair: poses[0] for pair, poses in self._of_tf.items() if len(poses) > 1 and _is_still(poses)}
         return {**same, **self.static}
 
@@ -350,9 +350,11 @@ def _largest_difference(poses: Floats) -> tuple[float, float]:
 
 
 def _is_still(poses: Floats) -> bool:
+    """Whether repeated transforms (N, 4, 4) are equal."""
     return max(_largest_difference(poses)) <= _STILL
 
 
 def _spread_text(poses: Floats) -> str:
+    """Text on how far transforms (N, 4, 4) differ."""
     metres, turn = _largest_difference(poses)
     return f"{metres:.3f} m and {np.degrees(turn):.1f} deg apart"

@@ -123,4 +123,5 @@ def _metadata(bag: Bag, topic: BagTopic) -> tuple[OusterSensor, str]:
 
 
 def _namespace(topic: BagTopic) -> str:
+    """Name of a topic without its last part."""
     return topic.name.rpartition("/")[0]

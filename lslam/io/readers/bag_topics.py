@@ -241,8 +241,9 @@ def _lateness(stamps: Stamps) -> tuple[Stamps, Bools]:
 
 
 def _told_again(stamps: Stamps, late: Stamps, step: float) -> Bools:
-    """(N,) whether late messages repeat a span of time: a clock was set back, so they interleave with others and fill no gap.
+    """(N,) whether late messages repeat a span of time that earlier ones covered, since a clock was set back.
 
+    Their stamps then lie among those of others and fill no gap.
     late : (N,) ns, delay of messages that came out of order, 0 for the others; step : usual time between two, ns
     """
     again = np.zeros(len(stamps), bool)
@@ -269,10 +270,12 @@ def _find_topic(bag: Bag, topics: list[BagTopic], choice: str, flag: str, what: 
 
 
 def _flags(topics: list[BagTopic], flag: str) -> str:
+    """Lines for a message: the option with each topic that could be chosen."""
     width = max(len(t.name) for t in topics)
     return "\n".join(f"  {flag} {t.name:<{width}}  ({len(t)} messages, {t.type})" for t in topics)
 
 
 def _listing(bag: Bag) -> str:
+    """Text for a message: all topics of the bag with their types."""
     topics = [f"{t.name} ({t.type or 'unknown type'}, {len(t)})" for t in bag.topics]
     return f"its topics are {', '.join(topics)}" if topics else "it has no topics at all"

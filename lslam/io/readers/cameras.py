@@ -118,6 +118,7 @@ def _rectified_camera(
 
 
 def _images(folder: Path, whose: str) -> list[Path]:
+    """Image files of a folder; raises InputError without any, with `whose` folder it is."""
     files = list_scans(folder, SUFFIXES)[0] if folder.is_dir() else []
     if not files:
         raise InputError(f"{folder}, {whose}, holds no images ({', '.join('*' + suffix for suffix in SUFFIXES)})")
@@ -125,6 +126,7 @@ def _images(folder: Path, whose: str) -> list[Path]:
 
 
 def _read_file(files: list[Path], k: int) -> Image:
+    """Pixels of file `k` of a list."""
     return read_image(files[k])
 
 
@@ -230,8 +232,10 @@ def _read_message(bag: Bag, topic: BagTopic, numbers: Longs, k: int) -> Image:
 
 
 def _state_in_toml(topic: BagTopic) -> str:
+    """Advice for a message: how to state the camera of a topic in `sequence.toml`."""
     return f'write [cameras.NAME] with images = "{topic.name}" in sequence.toml beside the bag'
 
 
 def _list_topics(topics: Mapping[str, BagTopic]) -> str:
+    """Text for a message: the image topics of the bag."""
     return f"it has {', '.join(topics)}" if topics else "it has none"

@@ -105,7 +105,10 @@ def agree(headers: Stamps, late_ns: Stamps, witness: Clock, what: str, voice: Vo
 
 
 def follow(stamps: Stamps, scans: Stamps, new_stamps: Stamps, what: str, voice: Voice) -> Stamps:
-    """Stamps (N,) corrected like the scans, from `scans` to `new_stamps` (M,), if they step with these; else unchanged."""
+    """Stamps (N,) of another stream, corrected like those of the scans, from `scans` to `new_stamps` (M,), all ns.
+
+    They are unchanged unless their clock steps together with that of the scans. what : the stream, for notes
+    """
     interval = float(np.median(np.diff(new_stamps))) if len(scans) > 1 else 0.0
     removed = np.diff(scans) - np.diff(new_stamps)
     at = np.flatnonzero(np.abs(removed) > 0.5 * interval)
@@ -127,7 +130,10 @@ def follow(stamps: Stamps, scans: Stamps, new_stamps: Stamps, what: str, voice: 
 
 
 def onto(stamps: Stamps, scans: Stamps, new_stamps: Stamps) -> Stamps:
-    """`new_stamps` (M,) on the one of the clocks of `scans` (M,) that overlaps most with another stream (N,)."""
+    """`new_stamps` (M,) of the scans, moved as a whole to the one of several offsets at which they overlap a stream (N,) most.
+
+    scans : (M,) ns, stamps before correction; their differences from `new_stamps` are the offsets
+    """
     shared = {
         int(offset): np.count_nonzero((new_stamps + offset >= stamps.min()) & (new_stamps + offset <= stamps.max()))
         for offset in [0, *np.unique(scans - new_stamps)[:_OFFSETS]]
@@ -175,7 +181,10 @@ def say_jitter(stamps: Stamps, what: str, voice: Voice) -> None:
 
 
 def _period_and_speed(h: Stamps, w: Stamps) -> tuple[float, float]:
-    """Interval, ns, 0 for a constant clock, and the relative speed of `w`, from the windows that agree best."""
+    """Usual interval, ns, of the clock `h` (N,), 0 if constant, and its ratio to that of the clock `w` (N,).
+
+    Medians over windows of several lengths; the window in which both clocks agree best counts.
+    """
     best = (np.inf, 0.0, 0.0)
     for length in _WINDOWS:
         if len(h) < 2 * length:
@@ -187,7 +196,10 @@ def _period_and_speed(h: Stamps, w: Stamps) -> tuple[float, float]:
 
 
 def _in_turns(h: Stamps, w: Stamps) -> bool:
-    """Whether two clocks alternate: many stamps are late and irregular once sorted, unlike the times of recording."""
+    """Whether the stamps `h` (N,) come from two clocks in turns: many are late and, sorted, irregular.
+
+    The times of recording `w` (N,) are regular then.
+    """
     if len(h) < _SPREAD_SAMPLES or np.mean(np.maximum.accumulate(h) > h) < _MANY:
         return False
     period, _ = _period_and_speed(h, w)
@@ -201,7 +213,7 @@ def runs(mask: Bools) -> Longs:
 
 
 def _set_back(h: Stamps, w: Stamps, late_ns: Stamps) -> Bools:
-    """(N,) whether late messages came in order, from a clock that was set back permanently."""
+    """(N,) mask of messages that are late only because their clock was set back for good; h, w : as of `_step_sizes`."""
     back = np.zeros(len(h), np.bool_)
     if not late_ns.any():
         return back
@@ -215,14 +227,17 @@ def _set_back(h: Stamps, w: Stamps, late_ns: Stamps) -> Bools:
 
 
 def _in_parts(h: Stamps) -> bool:
-    """Whether every scan consists of the same number of messages with one stamp."""
+    """Whether every scan consists of the same number of messages with one stamp; h : (N,) header stamps, ns."""
     counts = np.bincount(np.unique(h, return_inverse=True)[1], minlength=1)
     usual = int(np.median(counts))
     return 1 < usual < MESSAGES_PER_STAMP and bool(np.mean(counts == usual) > 1 - _MIN_SHARE)
 
 
 def _delay_range(w: Stamps, period: float) -> float:
-    """Spread of the recording delays of neighbouring messages, ns: messages often arrive in batches."""
+    """Spread of the recording delays of neighbouring messages, ns: messages often arrive in batches.
+
+    w : (N,) ns, times of recording; period : ns
+    """
     even = w - w[0] - np.arange(len(w)) * period
     spread = 0.0
     for length in _SPREAD_SAMPLES, 4 * _SPREAD_SAMPLES:

@@ -94,6 +94,7 @@ def _tr(folder: Folder) -> Floats | None:
 
 
 def _read_tr(path: Path) -> Floats:
+    """`T_cam0_lidar` (4, 4) of a `calib.txt`. Raises InputError without one."""
     T_cam0_lidar = read_odometry_calib(path)
     if T_cam0_lidar is None:
         raise InputError(f"{path} has no Tr (T_cam0_lidar): poses cannot be carried between camera and LiDAR")

@@ -254,6 +254,7 @@ def oxts_streams(oxts: Oxts, stamps_ns: Longs) -> tuple[ImuStream, GnssStream]:
 
 
 def _ground_truth(folder: Folder, stamps: Longs, oxts: Oxts | None, calibration: Calibration) -> Trajectory | None:
+    """LiDAR poses from the ground truth file that is stated, else from OXTS; None without either."""
     if folder.info.ground_truth is None:
         return None if oxts is None else oxts_truth(oxts, stamps, calibration.T_lidar_imu, folder.voice)
     truth = folder.truth(find_ground_truth(folder.path, folder.info, folder.voice), stamps)
@@ -374,6 +375,7 @@ def _drive_of(folder: Path, data_root: Path | None, missing: str, wish: str) -> 
 
 
 def _samples(drive: Path) -> tuple[Oxts, Longs]:
+    """OXTS samples of a drive and their stamps, ns; raises InputError without any."""
     oxts = read_oxts(drive / "oxts")
     if oxts is None or oxts.stamps_ns is None or not len(oxts.stamps_ns):
         raise InputError(f"{drive / 'oxts'} holds no samples with stamps (data/*.txt and timestamps.txt)")

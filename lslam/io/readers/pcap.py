@@ -34,6 +34,7 @@ class PcapSequence(SequenceOnDisk):
     revolutions: Revolutions
 
     def _read(self, index: int) -> Scan:
+        """Read revolution `index`, without times if the recording is motion compensated."""
         return read_scan(self.revolutions, index, not self.motion_compensated)
 
 

@@ -75,7 +75,7 @@ class Revolutions(Protocol):
         """(N,) ns, time of the first point of each."""
 
     def read(self, index: int) -> tuple[PointCloud, Longs]:
-        """Points of revolution `index` in the order they were measured, and the time of each, ns."""
+        """Points of revolution `index` in the order they were measured, and the time of each, ns, on the clock of `stamps_ns`."""
 
 
 @dataclass(frozen=True)
@@ -140,6 +140,7 @@ def metadata_beside(path: Path) -> Sequence[Path]:
 
 
 def _address(source: int) -> str:
+    """A sender's number as text: IPv4 address and port."""
     return ".".join(str(source >> shift & 255) for shift in (40, 32, 24, 16)) + f":{source & 0xFFFF}"
 
 
@@ -166,23 +167,25 @@ class VelodyneRevolutions:
         return np.array([self._stamp(turn) for turn in self.turns.tolist()], np.int64)
 
     def read(self, index: int) -> tuple[PointCloud, Longs]:
-        """Points of revolution `index` in the order they were measured, and the time of each, ns."""
+        """Points of revolution `index` in the order they were measured, and the time of each, ns, on the clock of `stamps_ns`."""
         turn = int(self.turns[index])
         # One packet more: the azimuth of the next block tells how far the last one turns.
         blocks = self._blocks(self._begin(turn), int(np.searchsorted(self.azimuth, (turn + 1) * TURN)) + 1)
         return points_of(blocks, blocks.azimuth // TURN == turn, self.began, self.model)
 
     def _stamp(self, turn: int) -> int:
+        """Time, ns, of the first block of revolution number `turn`."""
         begin = self._begin(turn)
         blocks = self._blocks(begin, begin + 2)
         times_ns = blocks.times_ns[blocks.azimuth >= turn * TURN]
         return int(times_ns[0] if len(times_ns) else self.times_ns[begin:][:2][-1])
 
     def _begin(self, turn: int) -> int:
-        """Packet in which a revolution begins."""
+        """Index of the packet in which revolution number `turn` begins."""
         return max(int(np.searchsorted(self.azimuth, turn * TURN, "right")) - 1, 0)
 
     def _blocks(self, begin: int, end: int) -> Blocks:
+        """Blocks of the packets from `begin` to before `end`."""
         packets = self.datagrams.payloads(self.packets[begin:end])
         return split_blocks(packets, self.azimuth[begin:end], self.times_ns[begin:end], self.model)
 
@@ -282,7 +285,7 @@ class OusterRevolutions:
     shift_ns: int
 
     def read(self, index: int) -> tuple[PointCloud, Longs]:
-        """Points of revolution `index` in the order they were measured, and the time of each, ns."""
+        """Points of revolution `index` in the order they were measured, and the time of each, ns, on the clock of `stamps_ns`."""
         first = int(self.first[index])
         packets = self.datagrams.payloads(self.packets[first : first + int(self.count[index])])
         cloud, times = ouster_points(packets, self.sensor)

@@ -125,6 +125,7 @@ def _agreement(clocks: list[Clock], voice: Voice) -> Stamps:
 
 
 def _is_suspicious(stamps: Stamps) -> bool:
+    """Whether stamps (N,) fail to increase somewhere, or have a gap."""
     steps = np.diff(stamps)
     return bool(len(steps)) and bool((steps <= 0).any() or steps.max() > _STEP * np.median(steps))
 
@@ -274,6 +275,7 @@ def _pairs(groups: list[list[str]], between: list[str]) -> Iterator[tuple[list[i
 
 
 def _in_unit(whole: list[str], rest: list[str], unit_ns: int) -> list[int]:
+    """Stamps, ns, of whole seconds and their fractions in a unit of `unit_ns`."""
     return [int(a) * 10**9 + int(b) * unit_ns for a, b in zip(whole, rest, strict=True)]
 
 
@@ -298,6 +300,7 @@ def _numbers(groups: list[list[str]]) -> list[tuple[list[int], str]]:
 
 
 def _is_time(texts: list[str], scale: int) -> bool:
+    """Whether all numbers, times `scale` in ns, are plausible times since 1970."""
     return all(len(text) < 20 and _EARLIEST_NS <= int(text) * scale <= _LATEST_NS for text in texts)
 
 
@@ -312,6 +315,7 @@ def _step_ns(stamps: list[int]) -> float:
 
 
 def _is_rate(stamps: list[int]) -> bool:
+    """Whether the median interval of stamps, ns, can be a scan period."""
     return _SHORTEST_NS <= _step_ns(stamps) <= _LONGEST_NS
 
 

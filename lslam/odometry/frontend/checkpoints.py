@@ -76,7 +76,7 @@ class CheckpointSchedule:
         return self._every_s > 0 and self._clock() >= self._next
 
     def wrote(self, seconds: float) -> None:
-        """A checkpoint was written, which took so long."""
+        """Set when the next checkpoint is due, after one that took `seconds` to write."""
         now = self._clock()
         wait = min(self._every_s, max(self.SOONEST_S, self.PART * (now - self._began)))
         self._next = now + max(wait, seconds / self.MOST_SHARE)
@@ -120,11 +120,12 @@ class Checkpoints:
         return None
 
     def clear(self) -> None:
-        """Forget them all: what begins again counts its scans from 0, and must not be mistaken for older."""
+        """Delete all checkpoints, so that a run from the start does not take an older run's for its own."""
         for path in self._files():
             path.unlink(missing_ok=True)
 
     def _files(self) -> list[Path]:
+        """Files of the checkpoints, oldest first."""
         return sorted(self.folder.glob(f"{self._stage}-*.npz"))
 
 

@@ -115,7 +115,7 @@ class ClockWindow:
 
     @cached_property
     def _steps(self) -> list[Floats]:
-        """Motion (4, 4) from scan to scan, without a clock."""
+        """Motions (4, 4) between successive scans, registered without point times."""
         poses = [at_poses.pose for at_poses in self._place(None, self._whole, None)]
         return [se3.relative(a, b) for a, b in pairwise(poses)]
 
@@ -203,10 +203,12 @@ def mean_score(windows: list[ClockWindow], clock: SweepClock | None) -> float:
 
 
 def _deskew(scan: Scan, sweep: MotionPrior) -> Floats:
+    """Points (N, 3), m, of a scan, deskewed to its stamp."""
     return np.asarray(deskew_points(scan.points, scan.times, sweep), np.float64)
 
 
 def _thin(count: int, most: int) -> Longs:
+    """Indices of at most `most` of `count` points, evenly spaced."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))
 
 

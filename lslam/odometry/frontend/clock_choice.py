@@ -115,6 +115,7 @@ def _judge(windows: list[ClockWindow], proposal: Proposal, sample: Scan) -> Cloc
 
 
 def _best(windows: list[ClockWindow], clocks: list[SweepClock | None]) -> SweepClock | None:
+    """The clock of the lowest mean score."""
     return min(clocks, key=lambda clock: mean_score(windows, clock))
 
 
@@ -184,6 +185,7 @@ def _is_alike(best: SweepClock | None, other: SweepClock | None, sample: Scan) -
 
 
 def _name(clock: SweepClock | None) -> str:
+    """Description of a clock, for the manifest."""
     if clock is None:
         return "no times"
     turn = f", begun {clock.turn:g} of a turn later" if clock.turn else ""

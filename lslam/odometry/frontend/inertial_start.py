@@ -139,7 +139,10 @@ def _begin(sequence: Sequence, imu: ImuStream, T_lidar_imu: Floats, config: Conf
 
 
 def with_imu_settings(config: Config) -> Config:
-    """The configuration of a run that the IMU predicts: better priors want a narrower search, which trims by itself."""
+    """The configuration with the narrower correspondence search `imu.inlier_distance` and no trimming, if an IMU is used.
+
+    Its motion priors are better than those of constant velocity.
+    """
     if not config.imu.use or config.imu.inlier_distance is None:
         return config
     narrow = config.registration.model_copy(update={"inlier_distance": config.imu.inlier_distance, "inlier_ratio": 1.0})
@@ -258,6 +261,7 @@ def _savings(results: list[ScanResult]) -> dict[str, Any]:
 
 
 def _round(values: Floats, digits: int) -> list[float]:
+    """The values as plain floats with so many decimal `digits`."""
     return [round(float(v), digits) for v in values]
 
 

@@ -55,6 +55,7 @@ class KeyframeSelector(Stateful):
         return Keyframe(self._count - 1, scan, result.stamp_ns, pose, result.covariance, self._travelled)
 
     def _is_due(self, pose: Floats) -> bool:
+        """Whether the pose (4, 4) is far enough from the last keyframe's."""
         if self._last is None:
             return True
         move, turn = se3.magnitude(se3.relative(self._last, pose))
@@ -105,6 +106,8 @@ QUEUE_SCANS = 3
 
 @dataclass(frozen=True)
 class _Due:
+    """A keyframe whose cloud waits for the motion within its sweep."""
+
     keyframe: Keyframe
     scan: Scan
 
@@ -127,7 +130,7 @@ class Keyframing(Stateful):
         self._unknown: list[_Due] = []
 
     def see(self, position: int, scan: Scan | None, result: ScanResult, motion: MotionPrior) -> None:
-        """Process the next scan of the run (None when unreadable); motion : of the sensor within its sweep.
+        """Make the next scan of the run a keyframe if one is due (scan: None when unreadable); motion : within its sweep.
 
         Raises OutputError when the store cannot be written, by this scan or one before.
         """
@@ -143,7 +146,7 @@ class Keyframing(Stateful):
             self._make(keyframe, scan, motion)
 
     def settle(self) -> None:
-        """Wait until every keyframe so far is in the store, whose index is then written."""
+        """Write all pending keyframes to the store, wait for them, and save its index."""
         self._make_unknown(None)
         self._wait(0)
         self.store.save()
@@ -172,12 +175,14 @@ class Keyframing(Stateful):
                 self._pool.shutdown()
 
     def _make_unknown(self, motion: MotionPrior | None) -> None:
+        """Make the keyframes that wait for the motion within a sweep, by this one, or without deskewing for None."""
         due, self._unknown = self._unknown, []
         for one in due:
             at_once = MotionPrior.at_once(one.keyframe.T_world_lidar)
             self._make(one.keyframe, one.scan, at_once if motion is None else motion)
 
     def _make(self, keyframe: Keyframe, scan: Scan, motion: MotionPrior) -> None:
+        """Make a keyframe's cloud and write it, in the background if there are threads."""
         if self._pool is None:
             self._write(keyframe, scan, motion)
             return
@@ -185,9 +190,11 @@ class Keyframing(Stateful):
         self._pending.append(self._pool.submit(copy_context().run, self._write, keyframe, scan, motion))
 
     def _write(self, keyframe: Keyframe, scan: Scan, motion: MotionPrior) -> None:
+        """Make a keyframe's cloud and labels, and add them to the store."""
         given = scan, motion, self._config.preprocess, self._config.keyframes
         self.store.add(keyframe, keyframe_cloud(*given), keyframe_labels(*given))
 
     def _wait(self, most: int) -> None:
+        """Wait until at most `most` keyframes are pending. Raises their errors."""
         while len(self._pending) > most:
             self._pending.pop(0).result()

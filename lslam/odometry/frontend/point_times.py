@@ -200,10 +200,12 @@ def later_choices(
 
 
 def _is_same(a: SweepClock | None, b: SweepClock | None, sample: Scan) -> bool:
+    """Whether two clocks deskew the points of `sample` alike."""
     return a == b or (a is not None and b is not None and is_same_motion(a, b, sample.points))
 
 
 def _candidates(clock: SweepClock) -> tuple[SweepClock | None, ...]:
+    """No clock, the clock, its reverse, and the clock begun parts of a turn later."""
     turned = (replace(clock, turn=(clock.turn + turn) % 1.0) for turn in TURNS)
     return None, clock, replace(clock, is_reversed=not clock.is_reversed), *turned
 

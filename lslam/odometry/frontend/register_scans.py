@@ -111,10 +111,9 @@ def _observe(
 
 
 def sweep_of(sequence: Sequence) -> Span | None:
-    """When sweeps begin and end, None when points have no times: the longest of the first scans with points speaks for all.
+    """Begin and end of a sweep, s from the stamp: the longest among the first scans with points; None without point times.
 
-    One that lasts half a period is long enough; a scan that lacks times, or has the end of a sweep alone, does not decide.
-    Motion compensated scans of which the first has none have none.
+    The search ends with a sweep of half a scan period. Motion compensated scans of which the first has no times have none.
     """
     spans: list[Span | None] = []
     for i in range(min(len(sequence), 10)):

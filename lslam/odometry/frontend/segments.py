@@ -34,13 +34,13 @@ class TrackedScan:
     has_both_sides: bool = False
 
     def transform(self, T: Floats) -> TrackedScan:
-        """In the world that `T` (4, 4) leads to."""
+        """The scan in another world, all poses multiplied by `T` (4, 4) from the left."""
         instant_ns, middle = self.middle
         sweep = replace(self.sweep, poses=T @ self.sweep.poses)
         return replace(self, result=self.result.in_world(T), sweep=sweep, middle=(instant_ns, T @ middle))
 
     def at(self, pose: Floats) -> TrackedScan:
-        """With the scan at another pose (4, 4)."""
+        """The scan moved as a whole to `pose` (4, 4), T_world_lidar."""
         return self.transform(pose @ se3.inverse(self.result.T_world_lidar))
 
 
@@ -109,7 +109,7 @@ class SegmentTracker(Stateful):
         return decided if other.result.status == "ok" else [*decided, *self._finish()]
 
     def _finish(self) -> list[TrackedScan]:
-        """The scans that are open, as the first hypothesis has them."""
+        """Decide for the old map: returns the undecided scans as its tracker registered them, and drops the new map."""
         bridged = [first for first, _ in self._open]
         self._other, self._open = None, []
         return bridged
@@ -120,7 +120,7 @@ class SegmentTracker(Stateful):
         return self._other is None and self.present.is_complete
 
     def restore(self, state: State) -> None:
-        """Go on where `state` was taken."""
+        """Replace the trackers and undecided scans by those of `state`."""
         super().restore(state)
         self._other, self._open = None, []
 
@@ -137,10 +137,12 @@ class SegmentTracker(Stateful):
         return registered
 
     def _trial(self, other: Tracker, entry: ScanInput) -> TrackedScan:
+        """Track the scan by the `other` tracker, on the new map, as one of the next segment."""
         return self._scan_by(other, entry, other.track(entry), self._segment + 1)
 
     @staticmethod
     def _scan_by(tracker: Tracker, entry: ScanInput, result: ScanResult, segment: int) -> TrackedScan:
+        """The scan with its result by a tracker, labelled with its segment."""
         return TrackedScan(entry, replace(result, segment=segment), tracker.sweep, tracker.middle)
 
 
@@ -150,4 +152,5 @@ def _is_less(result: ScanResult, other: ScanResult) -> bool:
 
 
 def _share(result: ScanResult) -> float:
+    """Share of a scan's points that are inliers, 0 to 1."""
     return result.inliers / max(result.source_points, 1)

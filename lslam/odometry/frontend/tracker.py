@@ -141,7 +141,7 @@ class Tracker(Stateful):
         super().restore(state)
 
     def _standing(self, scan: Scan | None) -> ScanResult | None:
-        """The result of a scan taken while the sensor was stationary; None where it has moved."""
+        """The result of a scan if the sensor has stood still, with which the motion model is updated; None if it has moved."""
         if scan is None or self.stationary is None:
             return None
         with self._clock.stage("standing"):
@@ -152,6 +152,7 @@ class Tracker(Stateful):
         return result
 
     def _keep(self, result: ScanResult) -> None:
+        """Keep an accepted result as the last one; drop the first scan once the speed is known."""
         if self.motion.is_known:
             self._first = None
         if result.status == "ok":

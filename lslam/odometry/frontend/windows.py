@@ -74,7 +74,7 @@ def _priors(tracks: list[TrackedScan]) -> list[MotionPrior]:
 
 
 def _tie(track: TrackedScan, position: Floats, covariance: Floats) -> TrackedScan:
-    """With the covariance (6, 6) of the pose at `position` (3,), m, to which its own is relative."""
+    """The scan with the covariance (6, 6) of the first pose, at `position` (3,), m, world, added to its own, relative one."""
     result = track.result
     spread = noise.transport(covariance, result.T_world_lidar[:3, 3] - position)
     own, by_points = (None if C is None else C + spread for C in (result.covariance, result.points_covariance))
@@ -284,12 +284,13 @@ class WindowTracker(Stateful):
         return out[:here], out[here:]
 
     def _to_world(self, tracks: list[TrackedScan]) -> list[TrackedScan]:
-        """In the world of the first pose."""
+        """The scans in the world of the run's corrected first pose, whose covariance is added to theirs."""
         world, start = self._world, self._start
         moved = tracks if world is None else [track.transform(world) for track in tracks]
         return moved if start is None else [_tie(track, *start) for track in moved]
 
     def _inliers(self) -> list[int]:
+        """Number of inliers of each decided scan."""
         return [track.result.inliers for track in self._decided]
 
     def _middles(self) -> list[tuple[int, Floats]]:
@@ -298,6 +299,7 @@ class WindowTracker(Stateful):
         return [*self._before, *now]
 
     def _course(self) -> Course:
+        """Splines through the middles of the window's sweeps."""
         instants, poses = zip(*self._middles(), strict=True)
         return Course(np.array(instants, np.int64), np.stack(poses))
 
@@ -317,11 +319,13 @@ class WindowTracker(Stateful):
             self._decided[k] = replace(track, result=work)
 
     def _set_course(self, course: Course | None) -> None:
+        """Have the motion model predict by a course, or by constant velocity for None."""
         motion = self.present.motion
         assert isinstance(motion, ConstantVelocity)
         motion.course = course
 
     def _is_whole(self) -> bool:
+        """Whether all decided scans belong to one segment."""
         return len({track.result.segment for track in self._decided}) == 1
 
     def _is_bent(self) -> bool:

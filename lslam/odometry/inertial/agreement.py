@@ -150,6 +150,7 @@ def _width(imu_rates: _GyroRates, scan_rates: Floats, stamps_ns: Longs, poses: F
 
 
 def _centre(scan_rates: Floats, imu_rates: Floats) -> tuple[Floats, Floats]:
+    """Both rates (M, 3), rad/s, of the scans that the IMU covers, less their means; M is 0 if it covers too few."""
     is_covered = np.isfinite(imu_rates).all(axis=1)
     if is_covered.sum() < max(5, len(imu_rates) // 2):
         return np.zeros((0, 3)), np.zeros((0, 3))
@@ -228,7 +229,7 @@ def _refuse_axes(imu_rates: _GyroRates, scan_rates: Floats, offsets: Floats) -> 
 
 
 def _best_axes(scan_rates: Floats, imu_rates: Floats) -> tuple[Floats, Floats]:
-    """What (3, 3) makes the `imu_rates` turns (M, 3) fit those `scan_rates` best: a rotation, and what may mirror them too."""
+    """Rotation (3, 3), and orthogonal matrix (3, 3) that may mirror too, by which `imu_rates` (M, 3) fit `scan_rates` best."""
     u, _, vt = np.linalg.svd(scan_rates.T @ imu_rates)
     M = u @ vt
     return np.asarray(u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(M))]) @ vt), np.asarray(M)

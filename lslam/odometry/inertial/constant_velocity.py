@@ -92,7 +92,7 @@ class MotionModel(Protocol):
         ...
 
     def rewind(self, stamp_ns: int, pose: Floats, span: Span) -> MotionPrior:
-        """Forget all scans but the first, taken at `stamp_ns` and `pose` (4, 4); its sweep by what is known of the speed."""
+        """Forget all scans but the first, at `stamp_ns` and `pose` (4, 4); returns the motion within its sweep."""
         ...
 
     def state(self) -> State:
@@ -118,7 +118,7 @@ class MotionModel(Protocol):
         return False
 
     def fuse(self, stamp_ns: int, result: RegistrationResult, prior: MotionPrior) -> RegistrationResult:
-        """A registration from `prior` fused with the sensor's prediction."""
+        """The registration from `prior` fused with the sensor's prediction. Here the result unchanged: there is no sensor."""
         return result
 
     def gravity_at(self, pose: Floats) -> GravityDirection | None:
@@ -185,7 +185,7 @@ class ConstantVelocity(Stateful, MotionModel):
         return sweep
 
     def steady(self, pose: Floats, span: Span) -> MotionPrior:
-        """As `sweep`, through the `pose` (4, 4) at the stamp."""
+        """Motion over the `span` (s) of a sweep by constant velocity, through the `pose` (4, 4) at its stamp."""
         if span.seconds <= 0 or self._step_s <= 0:
             return MotionPrior.at_once(pose)
         return _steady(pose, self._twist / self._step_s, knots_over(span))
@@ -233,7 +233,10 @@ class ConstantVelocity(Stateful, MotionModel):
         self._twist, self._step_s = velocity * step, step
 
     def rewind(self, stamp_ns: int, pose: Floats, span: Span) -> MotionPrior:
-        """Forget all scans but the first, taken at `stamp_ns` and `pose` (4, 4); its sweep by what is known of the speed."""
+        """Forget all scans but the first, at `stamp_ns` and `pose` (4, 4); returns the motion within its sweep.
+
+        It keeps the present velocity.
+        """
         prior = self.steady(pose, span)
         self._instant_ns, self._step_s, self._velocity = None, 0.0, None
         self.correct(stamp_ns, pose, prior)
@@ -241,6 +244,7 @@ class ConstantVelocity(Stateful, MotionModel):
 
 
 def _steady(pose: Floats, velocity: Floats, times: Floats) -> MotionPrior:
+    """Poses at `times` (K,), s from the stamp, of a sensor at `pose` (4, 4) with a constant `velocity` (6,) in its own axes."""
     return MotionPrior(times, se3.normalise(pose @ se3.exp(times[:, None] * velocity)))
 
 

@@ -173,7 +173,7 @@ class NavigationState:
         return replace(state, T_world_imu=T_world_imu)._share_covariance()
 
     def _shift(self, x: Floats, P: Floats) -> NavigationState:
-        """The state with covariance P, all parts but the pose moved by the error x (N,)."""
+        """The state with covariance P (N, N) after the error x (N,) was added to all parts but the pose."""
         e, gyro = self.estimate, x[DEVICE]
         gyroscope = replace(
             e.gyroscope,
@@ -201,7 +201,7 @@ class NavigationState:
         return self._shift(x, P)
 
     def _share_covariance(self) -> NavigationState:
-        """The parts of the covariance where the estimate has them too."""
+        """The state whose `estimate` has the blocks of the covariance that concern it."""
         P, e = self.covariance, self.estimate
         gyroscope: Gyroscope = replace(e.gyroscope, covariance=P[DEVICE, DEVICE])
         return replace(self, estimate=replace(e, covariance=P[REST, REST], gyroscope=gyroscope))
@@ -289,6 +289,6 @@ class FilterMotion(InertialMotion):
         self.estimate = self._now.estimate if not self.refusal else before
 
     def _of_lidar(self, state: NavigationState) -> Floats:
-        """(6, 6) covariance of the LiDAR's pose, world axes."""
+        """(6, 6) covariance of the LiDAR's pose, world axes, from that of the IMU's pose."""
         lever = (state.T_world_imu @ self.T_imu_lidar)[:3, 3] - state.T_world_imu[:3, 3]
         return noise.transport(state.covariance[POSE, POSE], lever)

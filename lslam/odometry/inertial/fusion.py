@@ -244,6 +244,7 @@ class InertialMotion(Stateful):
     def _prior(
         self, estimate: ImuEstimate, anchor_ns: int, anchor: Floats, stamp_ns: int, times: Floats
     ) -> MotionPrior:
+        """Poses of the LiDAR at `times` (K,), s from the stamp, by the IMU from its pose `anchor` (4, 4) at `anchor_ns`."""
         instants = stamp_ns + np.round(1e9 * times).astype(np.int64)
         k = int(np.searchsorted(instants, anchor_ns))
         step = estimate.over(self.imu, np.concatenate([instants[:k], [anchor_ns], instants[k:]]))
@@ -272,6 +273,7 @@ class InertialMotion(Stateful):
         return replace(self.estimate, velocity=speed * middle[:3, 0], gravity=-GRAVITY * middle[:3, 2])
 
     def _propagate(self, instant_ns: int) -> ImuEstimate:
+        """The estimate at `instant_ns`, by the IMU alone since the last scan."""
         return self.estimate.propagate(self._since_last(instant_ns), (self._pose @ self.T_lidar_imu)[:3, :3])
 
     def _since_last(self, instant_ns: int) -> Increments:

@@ -200,9 +200,9 @@ class Gyroscope:
         return self.rate_variance + step.hidden_density[1]
 
     def columns(self, step: Increments) -> Floats:
-        """(3, 12) by which the turn over `step` grows with bias and axes; the rate is taken for constant.
+        """Jacobian (3, 12) of the rotation over `step` by bias and rows of `axes`, at a constant rate.
 
-        (3, 13) where the offset is estimated: moved by it, a stream turns as much less at the end as at the beginning more.
+        (3, 13) where the clock offset is estimated: a later interval gains rotation at its end and loses some at its begin.
         """
         H = kalman.turn_columns(step.rotations[-1], step.velocity_arms[-1], self.axes, step.duration)
         if not self.has_offset:
@@ -223,11 +223,13 @@ class Gyroscope:
         return self._update(x, P, min(float(rest @ rest), INNOVATION_SIGMAS**2 * allowed) - allowed, step)
 
     def _update(self, x: Floats, P: Floats, excess: float, step: Increments) -> Gyroscope:
+        """The calibration of mean x and covariance P; `excess`, rad2, of a squared innovation raises the noise of the rates."""
         variance = max(self.rate_variance + excess / (3 * step.duration * NOISE_MEMORY_SCANS), self.noise.rate**2)
         offset = float(x[12]) if self.has_offset else self.offset_s
         return Gyroscope(x[:3], x[3:12].reshape(3, 3), P, variance, self.noise, offset, self.has_mounting)
 
 
 def _nearest_rotation(axes: Floats) -> Floats:
+    """The orthogonal matrix (3, 3) nearest to `axes` (3, 3)."""
     u, _, vt = np.linalg.svd(axes)
     return np.asarray(u @ vt)

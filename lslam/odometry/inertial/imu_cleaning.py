@@ -167,6 +167,7 @@ def _in_si(imu: ImuStream, notes: list[str]) -> Floats:
 
 
 def _text(values: Floats) -> str:
+    """The values as a tuple in text, for messages."""
     return "(" + ", ".join(f"{v:.4g}" for v in values) + ")"
 
 
@@ -262,6 +263,7 @@ def _excess(seconds: Floats, values: Floats, at_limit: Bools) -> Floats:
 
 
 def _slope(seconds: Floats, values: Floats, i: int, j: int) -> float:
+    """Slope of the readings between samples i and j, per s; 0 at an end of the stream."""
     if i < 0 or j >= len(values):
         return 0.0
     return float((values[j] - values[i]) / max(seconds[j] - seconds[i], 1e-9))

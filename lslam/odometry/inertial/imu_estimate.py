@@ -53,7 +53,7 @@ class PredictionErrors(Stateful):
 
     @property
     def medians(self) -> tuple[float, float] | None:
-        """Of all scans; None before the first."""
+        """Median error, m, of the sensor and of constant velocity over all scans; None before the first."""
         if not self._pairs:
             return None
         own, steady = np.median(np.array(self._pairs), axis=0)
@@ -69,11 +69,11 @@ class PredictionErrors(Stateful):
         }
 
     def state(self) -> State:
-        """All of them."""
+        """All errors so far, for a checkpoint."""
         return {"pairs": np.array(self._pairs).reshape(-1, 2)}
 
     def restore(self, state: State) -> None:
-        """Go on where `state` was taken."""
+        """Replace the errors by those of `state`."""
         self._pairs = [(float(own), float(steady)) for own, steady in state["pairs"]]
 
 
@@ -124,6 +124,7 @@ class ImuEstimate:
         return self._integrate(imu, instants_ns, self.gyroscope.bias)
 
     def _integrate(self, imu: ImuStream, instants_ns: Longs, gyro_bias: Floats) -> Increments:
+        """Motion measured by the IMU between instants, less this `gyro_bias` (3,), rad/s, and with the estimated calibration."""
         g = self.gyroscope
         return integrate(imu, instants_ns, gyro_bias, self.accel_bias, g.axes, g.mounting, g.offset_ns)
 

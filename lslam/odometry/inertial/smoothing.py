@@ -155,7 +155,7 @@ class SmootherMotion(InertialMotion):
         )
 
     def rewind(self, stamp_ns: int, pose: Floats, span: Span) -> MotionPrior:
-        """As of any IMU; the smoother begins again."""
+        """Forget all scans but the first, as `InertialMotion.rewind`; the smoother begins again too."""
         self._is_begun, self._added = False, None
         return super().rewind(stamp_ns, pose, span)
 
@@ -168,6 +168,7 @@ class SmootherMotion(InertialMotion):
         return self._since_last(instant_ns) if has_increments and not self.refusal else None
 
     def _withdraw(self) -> None:
+        """Remove the newest measurement from the smoother, if it is not confirmed yet."""
         if self._added is not None:
             self.smoother.withdraw()
             self._added = None

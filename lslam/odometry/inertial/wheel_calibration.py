@@ -39,7 +39,8 @@ U, ARM, YAW_SCALE, YAW_OFFSET, OFFSET_S = slice(0, 3), slice(3, 6), 6, 7, 8
 class WheelStep:
     """Motion of the LiDAR by its wheels from one instant to a later one, in its axes at the first.
 
-    pose : (4, 4); jacobian : (4, 9) of the way and of the turn about `up` by the states; way : m, without a sign; seconds : s
+    pose : (4, 4); jacobian : (4, 9) of translation (m) and rotation about `up` (rad) by the calibration's states
+    way : m, path length; seconds : s, duration
     """
 
     pose: Floats

@@ -258,10 +258,10 @@ class WheelMotion(ConstantVelocity):
 
 
 def _open(result: RegistrationResult) -> Floats:
-    """(6, 6) that a registration's covariance lacks: of directions that no surface holds it says a metre, and knows nothing.
+    """(6, 6) large covariance to add to a registration's, along directions that no surface observes.
 
-    The direction itself is known to a degree: by what is left of the others, hundreds of scans would tell a scale. So where a way
-    is open, ways teach nothing.
+    There the registration's own covariance is too small. Translation gets it in all axes: an unobserved direction is known to a
+    degree only, and its part in the other axes would bias the scale of the wheels over hundreds of scans.
     """
     ways, turns = result.degenerate[:, :3], result.degenerate[:, 3:] / result.lever_arm
     lacks = np.zeros((6, 6))
@@ -270,6 +270,7 @@ def _open(result: RegistrationResult) -> Floats:
 
 
 def _size(rest: Floats) -> float:
+    """Size, m, of an error (4,): translation (3,), m, and rotation, rad, at a lever arm of `LEVER_M`."""
     return float(np.linalg.norm(rest[:3]) + LEVER_M * abs(rest[3]))
 
 

@@ -83,7 +83,7 @@ class Moment:
         )
 
     def away(self, other: Moment) -> Floats:
-        """(15,) error of this state relative to `other`."""
+        """(15,) error of this state relative to `other`: position, rotation, velocity and both biases."""
         return np.concatenate(
             [
                 off_by(other.T_world_imu, self.T_world_imu),
@@ -133,11 +133,11 @@ class Window:
         return cls((moment,), e.gravity, e.gyroscope.axes, e.gyroscope.rate_variance, e.gyroscope.noise, past)
 
     def extend(self, moment: Moment) -> Window:
-        """With one more moment, the newest."""
+        """The window with one more moment, the newest."""
         return replace(self, moments=(*self.moments, moment))
 
     def with_equations(self, equations: dict[int, ScanEquations]) -> Window:
-        """With other equations of some scans, by their stamps."""
+        """The window with new normal equations of some scans, by their stamps."""
         return replace(
             self, moments=tuple(replace(m, equations=equations.get(m.stamp_ns, m.equations)) for m in self.moments)
         )
@@ -270,14 +270,14 @@ class Window:
 
 @lru_cache(maxsize=64)
 def certainty(nanoseconds: int, rate_variance: float, noise: ImuNoise) -> Floats:
-    """(15, 15) information of the increments over so long, read only."""
+    """(15, 15) information of an IMU factor over so many nanoseconds: the inverse of its process noise; a read-only array."""
     W = np.linalg.inv(process_noise(1e-9 * nanoseconds, rate_variance, noise)[np.ix_(OWN, OWN)])
     W.flags.writeable = False
     return W
 
 
 def moment_of(state: NavigationState, instant_ns: int, stamp_ns: int, T_imu_scan: Floats) -> Moment:
-    """A moment where the state is."""
+    """The moment at `instant_ns` with the pose, velocity and biases of a filter state."""
     e = state.estimate
     return Moment(instant_ns, stamp_ns, state.T_world_imu, e.velocity, e.accel_bias, e.gyroscope.bias, T_imu_scan)
 
@@ -290,7 +290,10 @@ def off_by(a: Floats, b: Floats) -> Floats:
 
 
 def loosen(H: Floats, g: Floats, part: slice, variance: float) -> tuple[Floats, Floats]:
-    """Normal equations after a `part` of what they speak of walked by so much: the Schur complement of where it was."""
+    """Normal equations H, g after the variables `part` moved by a random walk of `variance`.
+
+    Their values before it are marginalised by the Schur complement.
+    """
     K = np.linalg.inv(np.eye(part.stop - part.start) / variance + H[part, part])
     return H - H[:, part] @ K @ H[part], g - H[:, part] @ K @ g[part]
 
@@ -317,12 +320,12 @@ class WindowMotion(FilterMotion):
         self._joint: Window | None = None
 
     def sweep(self, stamp_ns: int, span: Span) -> MotionPrior:
-        """As of the filter."""
+        """Predicted poses over the `span` of the sweep, as by `FilterMotion.sweep`. Drops the equations of the last scan."""
         self._equations, self._joint = {}, None
         return super().sweep(stamp_ns, span)
 
     def take(self, equations: Iterable[ScanEquations]) -> None:
-        """What the points of some scans say of their poses, for the estimates to come."""
+        """Store the normal equations of some scans for the next joint estimates."""
         self._equations |= {one.stamp_ns: one for one in equations}
 
     def fuse(self, stamp_ns: int, result: RegistrationResult, prior: MotionPrior) -> RegistrationResult:

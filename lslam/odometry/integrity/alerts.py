@@ -174,6 +174,7 @@ def _open(checks: list[MotionCheck]) -> list[Alert]:
 
 
 def _is_rest(motion: Floats) -> bool:
+    """Whether a motion (4, 4) is too small to count as motion."""
     return is_within(motion, SAME_M)
 
 
@@ -263,7 +264,7 @@ def _is_by_stamps(positions: Floats, seconds: Floats, apart: int = 1) -> Bools:
 
 
 def _groups(at: Longs) -> list[Longs]:
-    """Jumps less than three scans apart are one."""
+    """Split the ascending indices of jumps into groups: more than three scans apart begins another."""
     return np.split(at, np.flatnonzero(np.diff(at) > 3) + 1) if len(at) else []
 
 

@@ -155,19 +155,20 @@ class PairRegistration:
         self._terms = voxel_terms(PLANES_ALONE, PLANES_ALONE.points(last, sigma), self._planes, self._matches, sigma)
 
     def near(self, start: Floats) -> MotionHypothesis:
-        """The motion that fits near a start (4, 4): planes capture points as far as they reach."""
+        """The motion (4, 4) registered from `start`, within reach of the planes."""
         widest = max(CAPTURE_EDGES * self._edge, KERNEL_MIN_M)
-        return self._lay(start, Annealing(widest, SETTINGS.max_iterations))
+        return self._register(start, Annealing(widest, SETTINGS.max_iterations))
 
     def far(self, start: Floats) -> MotionHypothesis:
-        """The motion that fits best some metres around a start (4, 4)."""
-        return self._lay(start, Annealing.slow(COARSE_KERNEL_M))
+        """The motion registered from `start` (4, 4) by a search of some metres around it."""
+        return self._register(start, Annealing.slow(COARSE_KERNEL_M))
 
     def at(self, motion: Floats) -> MotionHypothesis:
-        """How the scan fits at a motion (4, 4)."""
-        return self._lay(motion, Annealing.once(KERNEL_MIN_M))
+        """The hypothesis of a given motion (4, 4), refined by one step, with the points that fit there."""
+        return self._register(motion, Annealing.once(KERNEL_MIN_M))
 
-    def _lay(self, start: Floats, annealing: Annealing) -> MotionHypothesis:
+    def _register(self, start: Floats, annealing: Annealing) -> MotionHypothesis:
+        """Register the later scan on the planes from `start` (4, 4), and mark the points that lie on them."""
         motion = optimise(Problem(self._terms, start, annealing, Limits(SETTINGS.weak_share), self._matches))
         distance2 = self._matches.distance2
         cells = directions(se3.apply(motion.T_world_lidar, self._source))

@@ -53,6 +53,7 @@ def _product(A: Floats, B: Floats) -> Floats:
 
 @kernel
 def _transpose(A: Floats) -> Floats:
+    """A copy of A (M, N), transposed and contiguous."""
     out = np.empty((A.shape[1], A.shape[0]))
     for i in range(A.shape[0]):
         for j in range(A.shape[1]):
@@ -72,6 +73,7 @@ def _sum(A: Floats, B: Floats, factor: float) -> Floats:
 
 @kernel
 def _copy(A: Floats) -> Floats:
+    """A copy of A."""
     out = np.empty(A.shape)
     for i in range(A.shape[0]):
         for j in range(A.shape[1]):
@@ -81,7 +83,7 @@ def _copy(A: Floats) -> Floats:
 
 @kernel
 def _in_axes_of(H: Floats, P: Floats) -> Floats:
-    """H P H^T."""
+    """Covariance H P H^T of a linear function H (M, N) of what has covariance P (N, N)."""
     return _product(_product(H, P), _transpose(H))
 
 

@@ -72,6 +72,7 @@ def straighten(R: Floats) -> None:
 
 @inline
 def _between(A: Floats, B: Floats, R: Floats, out: Floats) -> None:
+    """out (3,) <- rotation vector, rad, of A^T B, which is stored in R (3, 3)."""
     for i in range(3):
         for j in range(3):
             R[i, j] = A[0, i] * B[0, j] + A[1, i] * B[1, j] + A[2, i] * B[2, j]

@@ -22,6 +22,7 @@ def upright_plane(
 ) -> tuple[float, float]:
     """Horizontal unit normal of the points in the eight cells about a corner of the lattice; 0, 0 where they are no wall.
 
+    ix, iy, iz : of the corner; table, keys, sums : the cells' hash table, keys and moments
     tilt : largest vertical part of a wall's unit normal; thickness : largest standard deviation across it, m
     total : (10,) workspace for the sum of the moments
     """
@@ -139,9 +140,10 @@ def flat_walls(
 
 @inline
 def best_line(flat: Floats, tries: Longs, first: int, tolerance: float, agreement: float) -> int:
-    """Row whose line, through its position and across its normal, has most points, among the rows `tries[first]`.
+    """Row of `flat` (M, 5), one of `tries[first]`, whose line has most points.
 
-    A point lies on a line within `tolerance`, m, and if the cosine between the normals is at least `agreement`.
+    The line goes through the row's position, across its normal. A point lies on it within `tolerance`, m, and if the cosine
+    between the normals is at least `agreement`.
     """
     best, best_score = -1, -1.0
     for t in range(tries.shape[1]):

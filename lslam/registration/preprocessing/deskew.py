@@ -50,7 +50,7 @@ def deskew(points: PreparedPoints, prior: MotionPrior) -> PreparedPoints:
 
 
 def _knots(prior: MotionPrior) -> tuple[float, float, Floats]:
-    """Start, step and (SWEEP_KNOTS, 3, 4) poses within the sweep, seen from the pose at the stamp."""
+    """First time and step, s, and (SWEEP_KNOTS, 3, 4) poses within the sweep relative to the pose at the stamp."""
     within = se3.relative(prior.pose, prior.poses)
     start, end = float(prior.times[0]), float(prior.times[-1])
     if len(within) != SWEEP_KNOTS:

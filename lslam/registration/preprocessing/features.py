@@ -76,12 +76,12 @@ class Features:
 
     @property
     def cloud(self) -> NDArray[np.float32]:
-        """All of them (N, 3), m, LiDAR frame."""
+        """The points of all parts (N, 3), m, LiDAR frame."""
         parts = (self.less_planes, self.planes, self.less_edges, self.neither)
         return np.concatenate([part.points for part in parts], dtype=np.float32)
 
     def each(self, change: Callable[[FeaturePoints], FeaturePoints]) -> Features:
-        """With all parts changed alike."""
+        """The features after `change` of each of their parts."""
         names = ("edges", "less_edges", "planes", "less_planes", "neither")
         parts: dict[str, Any] = {name: change(getattr(self, name)) for name in names}
         return replace(self, **parts)
@@ -230,7 +230,7 @@ def _thin(
     times: NDArray[np.float32] | None,
     grid_step: float,
 ) -> FeaturePoints:
-    """The points of the `mask` (N,) of a ring walk, or their centroids in cells of `grid_step`, m, ring by ring; 0: points."""
+    """The points of the `mask` (N,), or, for a `grid_step` above 0, m, their centroids in cells of it, ring by ring."""
     at = np.flatnonzero(mask)
     if grid_step == 0:
         return FeaturePoints(walk.points[at], rings[at], None if times is None else times[at])

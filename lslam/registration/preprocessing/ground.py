@@ -52,14 +52,17 @@ def world_up_of(config: PreprocessConfig, T_world_lidar: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class Ground:
-    """The ground under one scan's points: (3, 3) rotation that levels them, cells in half a side of the grid, and heights, m."""
+    """The ground under one scan's points, a height for each cell of a square grid.
+
+    R : (3, 3) levels the points; half : cells in half a side; top : heights of the ground in the level frame, m
+    """
 
     R: Floats
     half: int
     top: Floats
 
     def above(self, points: NDArray[np.float32], height: float = GROUND_TOLERANCE_M) -> Longs:
-        """Indices of those of the scan's points (N, 3), m, that lie higher above it than `height`, m, increasing."""
+        """Indices, increasing, of the scan's points (N, 3), m, LiDAR frame, more than `height`, m, above the ground."""
         return ground.above(points, self.R, GROUND_CELL_M, self.half, self.top, height)
 
 
@@ -89,9 +92,9 @@ def ground_of(points: NDArray[np.float32], up: Floats = Z) -> Ground:
 
 
 def levelling(points: NDArray[np.float32], tolerance: float, half: int, up: Floats = Z) -> tuple[Floats, float]:
-    """(3, 3) rotation that makes the dominant plane of the lowest points horizontal, and its height then, m.
+    """(3, 3) rotation that makes the dominant plane of the lowest points horizontal, and the height of that plane then, m.
 
-    Without such a plane the frame levelled by `up` (3,), and minus infinity.
+    Without such a plane: the rotation that makes `up` (3,) vertical, and minus infinity.
     """
     if np.array_equal(up, Z):
         return _levelling(points, tolerance, half)
@@ -101,7 +104,7 @@ def levelling(points: NDArray[np.float32], tolerance: float, half: int, up: Floa
 
 
 def _levelling(points: NDArray[np.float32], tolerance: float, half: int) -> tuple[Floats, float]:
-    """`levelling` of points whose z is about up."""
+    """`levelling` of points whose z axis is nearly vertical."""
     index = ground.lowest(points, np.eye(3), GROUND_CELL_M, half)
     low = points[index[index >= 0]].astype(np.float64)
     if len(low) < 3:

@@ -131,7 +131,7 @@ def prepare_points(
 
 
 def thin(points: PreparedPoints, step: int) -> PreparedPoints:
-    """Every `step`-th source point."""
+    """The points with every `step`-th source point only; the map points stay."""
     return subset(points, slice(None, None, step))
 
 
@@ -205,7 +205,10 @@ def _gate_of(config: PreprocessConfig) -> tuple[float, float, bool, Floats]:
 def _gate_cloud(
     cloud: NDArray[np.float32], times: NDArray[np.float32], config: PreprocessConfig
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """The points that `gate_points` keeps, and their times: in one pass where only the gate asks."""
+    """The points (N, 3), m, that `gate_points` keeps, and their times.
+
+    Without `remove_ground` and `denoise` one kernel does both.
+    """
     if not (config.remove_ground or config.denoise):
         return voxel.select_in_gate(cloud, times, *_gate_of(config))
     rows = gate_points(cloud, config)
@@ -223,6 +226,10 @@ def _source_points(
     config: PreprocessConfig,
     index: int,
 ) -> Down:
+    """Source points, times and scatter as `config.downsample` says: from the map points' centroids, or from raw points.
+
+    index : of the scan, seeds the random choice
+    """
     if config.downsample == "target":
         return _target_count(map_points, map_times, config)
     if config.downsample == "grid":

@@ -139,7 +139,10 @@ def ring_seam(points: NDArray[Any]) -> float | None:
 
 
 def _cut_rings(points: NDArray[Any]) -> tuple[NDArray[np.uint16] | None, float]:
-    """Rings and their seam: the angle at which most jumps of elevation happen, since all rings begin there."""
+    """Rings (N,) of points stored ring after ring, None where they are not, and their seam, rad.
+
+    All rings begin at the seam, so it is the angle at which most jumps of elevation happen.
+    """
     turned, slope, jumps, ahead = ring_order.follow(np.ascontiguousarray(points, np.float32), _BACKWARD, _TILT)
     if ahead < _AHEAD:
         return None, 0.0
@@ -161,7 +164,7 @@ def _is_staircase(values: Floats) -> bool:
 
 
 def _stab(start: Floats, end: Floats) -> float:
-    """The angle within 0..2 pi that most of the arcs from `start` to `end` (M,), rad, contain; the middle of where they meet."""
+    """The angle within 0..2 pi that most of the arcs from `start` to `end` (M,), rad, contain: the middle of their overlap."""
     full = 2 * np.pi
     low = np.remainder(start, full)
     high = low + np.minimum(end - start, full)
@@ -176,6 +179,7 @@ def _stab(start: Floats, end: Floats) -> float:
 
 
 def _decide_field(scans: list[Scan]) -> RingRule | None:
+    """The rule to take the ring field; None where most scans lack it or it holds one value."""
     fields = [np.unique(s.rings[s.rings != NO_RING]) for s in scans if s.rings is not None]
     if 2 * len(fields) <= len(scans):
         return None
@@ -185,7 +189,7 @@ def _decide_field(scans: list[Scan]) -> RingRule | None:
 
 
 def _decide_rows(scans: list[Scan], count: int | None) -> RingRule | None:
-    """The layout of most scans: points that are stored ring after ring can be cut into rows where their number allows it."""
+    """The row layout that most scans have, of `count` rows if given; None without one."""
     rule, having = Counter(organised_rows(scan, count) for scan in scans).most_common(1)[0]
     return rule if 2 * having > len(scans) else None
 
@@ -214,6 +218,10 @@ def _has_rows(points: NDArray[np.float32], rows: int, columns: bool) -> bool:
 
 
 def _rows(scan: Scan, rows: int, columns: bool) -> NDArray[np.uint16]:
+    """(N,) row of each point; raises InputError where the points are not `rows` rows of equal length.
+
+    columns : whether points are stored column after column
+    """
     if len(scan) % rows:
         raise InputError(f"scan {scan.index}: {len(scan)} points are not {rows} rows of equal length: see --rings")
     index = np.arange(len(scan))
@@ -221,11 +229,13 @@ def _rows(scan: Scan, rows: int, columns: bool) -> NDArray[np.uint16]:
 
 
 def _decide_order(scan: Scan) -> RingRule | None:
+    """The rule to cut rings by the order of the points; None where the scan is not stored ring after ring."""
     rings = rings_by_order(scan.points)
     return None if rings is None else RingRule("order", int(rings.max()) + 1)
 
 
 def _decide_elevation(scans: list[Scan], count: int | None, beams: int | None) -> RingRule | None:
+    """The rule by clusters of elevation, `count` of them if given; None where there are none or more than `beams`."""
     pooled = np.concatenate([elevations(s.points) for s in scans])
     borders = elevation_borders(pooled[np.isfinite(pooled)].astype(np.float64), count)
     if borders is None or (beams is not None and count is None and len(borders) + 1 > beams):
@@ -234,6 +244,7 @@ def _decide_elevation(scans: list[Scan], count: int | None, beams: int | None) -
 
 
 def _refusal(kind: str, count: int | None, scan: Scan) -> str:
+    """Message that the scans have no rings of the `kind`, with what to do instead."""
     beams = f"{count} " if count else ""
     why = {
         "auto": "have no ring field, are not organised in rows, do not follow the beams in their order, and their "
@@ -283,6 +294,7 @@ def ring_gap(points: NDArray[np.float32]) -> float:
 
 
 def _borders(elevation: Floats, width_deg: float) -> Floats:
+    """Elevations, rad, at the minima between the peaks of a histogram smoothed by `width_deg`."""
     edges = np.radians(np.arange(-90.0, 90.0 + _BIN_DEG, _BIN_DEG))
     counts = np.histogram(elevation, edges)[0].astype(np.float64)
     reach = round(3 * width_deg / _BIN_DEG)
@@ -294,7 +306,7 @@ def _borders(elevation: Floats, width_deg: float) -> Floats:
 
 
 def _valleys(density: Floats) -> list[int]:
-    """Where the density falls far enough between two peaks."""
+    """Bins of the minima of a density that are deep enough below the peaks on both sides."""
     rising = np.diff(density, prepend=0.0) > 0
     peaks = np.flatnonzero(rising & (np.diff(density, append=0.0) <= 0))
     heights: list[float] = []
@@ -312,7 +324,10 @@ def _valleys(density: Floats) -> list[int]:
 
 
 def _without_small(borders: list[int], total: Floats) -> list[int]:
-    """Leave out stray points: a cluster of next to none joins the neighbour that has less. `total` counts points up to a bin."""
+    """The borders (bins) without those of clusters with next to no points, which join the smaller neighbour.
+
+    total : number of points up to each bin
+    """
     while borders:
         mass = np.diff(total[[0, *borders, len(total) - 1]])
         least = int(mass.argmin())

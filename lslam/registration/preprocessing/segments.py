@@ -75,6 +75,7 @@ def lego_features(
 
 
 def _segment(scan: Scan, walk: RingWalk, vertical: Floats) -> Segments:
+    """Segment a scan in its range image into ground and clusters; vertical : (3,) approximate up."""
     slopes = range_image.row_slopes(walk.points, walk.starts) * (1.0 if vertical[2] >= 0 else -1.0)
     with_slope = np.flatnonzero(np.isfinite(slopes))
     row = np.zeros(len(slopes), np.int64)

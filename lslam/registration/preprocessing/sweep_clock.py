@@ -126,6 +126,7 @@ def _is_even(steps: Floats) -> bool:
 
 
 def _over(values: Floats, by: Floats) -> Floats:
+    """Quotient of values by the positive ones of `by`, elsewhere 0."""
     return np.divide(values, by, out=np.zeros_like(values), where=by > 0)
 
 
@@ -163,7 +164,7 @@ class SweepClock:
     turn: float = 0.0
 
     def times_of(self, points: NDArray[Any]) -> tuple[NDArray[np.float32], str]:
-        """Times (N,) float32, s from the stamp, of points (N, 3), and why they are not by the rule; empty where they are."""
+        """Times (N,) float32, s from the stamp, of points (N, 3); and why another rule had to be used, else empty."""
         shares, why = self._shares(points)
         shares = 1 - shares if self.is_reversed else shares
         if self.turn:
@@ -172,6 +173,7 @@ class SweepClock:
         return (begin_s + self.seconds * shares).astype(np.float32), why
 
     def _shares(self, points: NDArray[Any]) -> tuple[Floats, str]:
+        """Share of the sweep (N,), 0 to 1, at each of points (N, 3); and why another rule had to be used, else empty."""
         n = len(points)
         if self.kind == "columns":
             why = f"{n} points are not {self.rows} rows of equal length"
@@ -201,7 +203,7 @@ class SweepClock:
         return late + sweep.turned_rad / _FULL, ""
 
     def facts(self) -> dict[str, Any]:
-        """As plain values, for a manifest."""
+        """The clock as plain values, for a manifest."""
         return asdict(self)
 
     def __str__(self) -> str:
@@ -239,9 +241,9 @@ def azimuths(points: NDArray[Any]) -> Floats:
 
 
 def even_begin(points: NDArray[Any], shares: Floats, sense: int) -> float | None:
-    """Azimuth, rad, at which points (N, 3) begin that turn evenly in this sense with `shares` (N,) of the sweep.
+    """Azimuth, rad, of share 0, if points (N, 3) turn in this sense in proportion to `shares` (N,) of the sweep; else None.
 
-    None where they do not; 0 for points of which none is usable.
+    0 where no point is usable. sense : 1 counter-clockwise, -1 clockwise
     """
     step = len(points) // _LOOKED_AT | 1  # odd: rows are even in number
     points, shares = points[::step], shares[::step]
@@ -354,6 +356,7 @@ def _coverage(scans: list[Scan]) -> float:
 
 
 def _first_azimuth(scan: Scan) -> float:
+    """Azimuth, rad, of the first usable point of a scan; 0 without one."""
     points = scan.points
     usable = np.flatnonzero(np.isfinite(points).all(axis=1) & (points[:, :2] != 0).any(axis=1))
     return float(azimuths(points[usable[:1]])[0]) if len(usable) else 0.0

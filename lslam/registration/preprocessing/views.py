@@ -226,7 +226,7 @@ class MergedLidars(SequenceView):
                 yield _transform(scan, which, at_ns, stamp_ns, source.lidar.T_lidar_other, number)
 
     def _describe(self, source: _Reading) -> None:
-        """Say how a further LiDAR is used; raise InputError when none of its scans falls into a sweep."""
+        """Add how a further LiDAR is used to notes and problems; raise InputError when none of its scans falls into a sweep."""
         name, scans = source.lidar.name, source.lidar.scans
         self.notes += [f"{name}: {note}" for note in scans.notes]
         self.problems += [f"{name}: {problem}" for problem in scans.problems]
@@ -245,10 +245,10 @@ class MergedLidars(SequenceView):
 
 
 def _source(lidar: FurtherLidar, middle_ns: int) -> _Reading:
-    """When each of its scans begins and ends.
+    """A further LiDAR with begin and end, ns, of each of its scans.
 
-    middle_ns : from a stamp of the leading LiDAR to its edge, and half a sweep more: scans without times are moved by it, so
-        that they fall into the sweep whose stamp is nearest
+    middle_ns : added to the stamps of scans without times: from a stamp of the leading LiDAR to the begin of its sweep, and
+        half a sweep more, so that they fall into the sweep whose stamp is nearest
     """
     sweep, stamps = _sweep_of(lidar.scans), lidar.scans.stamps_ns
     if sweep is None:
@@ -266,6 +266,7 @@ def _sweep_of(sequence: Sequence) -> Span | None:
 
 
 def _period_ns(sequence: Sequence) -> int:
+    """Median time between scans, ns."""
     steps = np.diff(sequence.stamps_ns)
     return round(float(np.median(steps))) if len(steps) else round(1e9 / sequence.rate_hz)
 
@@ -277,7 +278,7 @@ def _apart_ns(stamps: Longs, others: Longs) -> float:
 
 
 def _read(lidar: FurtherLidar, index: int) -> Scan | None:
-    """A scan; None, which is said, when it cannot be read: the sweep has the points of the other LiDARs."""
+    """Read a scan; None, with a warning, when it cannot be read: the sweep then has the points of the other LiDARs only."""
     try:
         return lidar.scans.scan(index)
     except InputError as error:
@@ -286,14 +287,20 @@ def _read(lidar: FurtherLidar, index: int) -> Scan | None:
 
 
 def _is_far(points: NDArray[np.float32]) -> Bools:
-    """Which points (N, 3) are finite and neither at the sensor nor on what carries it; elsewhere (0, 0, 0) would be a place."""
+    """Mask of the points (N, 3) that are finite and beyond the sensor and what carries it.
+
+    Points (0, 0, 0), which are no returns, would become valid ones in another frame.
+    """
     with np.errstate(invalid="ignore", over="ignore"):
         squared = points[:, 0] ** 2 + points[:, 1] ** 2 + points[:, 2] ** 2
         return np.asarray((squared >= np.float32(_NEAREST_M**2)) & np.isfinite(squared))
 
 
 def _transform(scan: Scan, which: Bools, at_ns: Longs, stamp_ns: int, T: Floats, number: int) -> Scan:
-    """The points `is_used`, of the `number`-th further LiDAR, in the frame of the leading one, with times from `stamp_ns`."""
+    """The points of `which` (N,), of the `number`-th further LiDAR, in the frame of the leading one by T (4, 4).
+
+    at_ns : (N,) times of the points; stamp_ns : stamp of the merged scan, from which its times count
+    """
     from lslam.core.kernels.transform import transform
 
     part = scan.select(which)
