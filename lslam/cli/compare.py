@@ -117,6 +117,7 @@ def _plan(sequences: tuple[str, ...], given: dict[str, Any]) -> Plan:
 
 
 def _is_ready(word: str) -> bool:
+    """Whether a word names a comparison that ships with lslam."""
     from lslam.studies.ready_comparison import comparison_names
 
     return word in comparison_names()
@@ -163,6 +164,7 @@ def _ready_plan(name: str, given: dict[str, Any]) -> Plan:
 
 
 def _crop(text: str | None) -> tuple[float, float, float] | None:
+    """Values of --crop: x, y and size, m; None without it."""
     if text is None:
         return None
     x, y, size = options.numbers("--crop", text, (3,), "x, y and size in metres, for example 12,-40,20")

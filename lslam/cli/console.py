@@ -254,13 +254,14 @@ def _plain(title: str, total: int, unit: str, remaining: RemainingTime) -> Advan
 
 
 def _pace(remaining: RemainingTime, unit: str) -> str:
+    """Text of the speed: units per second, or seconds per unit if slow."""
     is_fast = unit == "scans" and remaining.usual <= 1
     return f"{1 / max(remaining.usual, 1e-9):.1f} {unit}/s" if is_fast else remaining.pace
 
 
 @contextmanager
 def _tell_steps(to: Events, title: str, total: int, unit: str, remaining: RemainingTime) -> Iterator[Advance]:
-    """The stage as events: when it begins and ends, and at most one a second between."""
+    """Write the stage as events: its begin, its end, and at most one a second between."""
     began = last = time.monotonic()
     done = 0
     steps = {"steps": total, "unit": unit} if total else {}
@@ -288,6 +289,7 @@ def _tell_steps(to: Events, title: str, total: int, unit: str, remaining: Remain
 
 @contextmanager
 def _bar(title: str, total: int, unit: str, remaining: RemainingTime) -> Iterator[Advance]:
+    """Progress bar on a terminal."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn
     from rich.table import Column
     from rich.text import Text

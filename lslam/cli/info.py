@@ -140,6 +140,7 @@ def _show_machine(sequence: str | None, machine: bool, as_json: bool) -> None:
 
 
 def _show_topics(bag: dict[str, Any]) -> None:
+    """Print the topics of a bag."""
     show("\ntopics\n" + "".join(f"  {line}\n" for line in topic_lines(bag)))
 
 
@@ -218,6 +219,7 @@ def _looked_at(points: dict[str, Any]) -> str:
 
 
 def _limits(limits: list[float] | None, unit: str) -> str:
+    """Text of the smallest and largest value."""
     return "none" if limits is None else f"{limits[0]:.6g} .. {limits[1]:.6g}{unit}"
 
 

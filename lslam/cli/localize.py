@@ -70,6 +70,7 @@ def command(sequence: str, map_path: Path, **given: Any) -> None:
 
 
 def _start_of(text: str) -> list[float]:
+    """Values of --start: x, y, m, and heading, deg; raises click.UsageError for others."""
     if text.isdecimal():
         raise click.UsageError(
             f"--start {text}: a place in the map, X,Y,HEADING; to begin at that scan say --first {text}"

@@ -58,6 +58,7 @@ def machine_document() -> dict[str, Any]:
 
 
 def _cores() -> dict[str, Any]:
+    """Number of cores: of the machine, usable, and the container's limit."""
     from lslam.core.machine import available_cores
 
     return {"machine": os.cpu_count(), "usable": available_cores(), "container": _container("cpu.max")}
@@ -111,6 +112,7 @@ def _browser() -> dict[str, Any]:
 
 
 def _proj() -> dict[str, Any]:
+    """PROJ and its installed grids."""
     from lslam.core.geometry.geodesy import installed_grids
 
     return installed_grids()
@@ -151,10 +153,12 @@ def machine_rows(document: dict[str, Any]) -> Iterator[tuple[str, str]]:
 
 
 def _gb(size: float | None) -> str:
+    """Size in GB as text."""
     return "unknown" if size is None else f"{size / 1e9:.1f} GB"
 
 
 def _limit(value: float | None, text: Callable[[float], str]) -> str:
+    """Text about the container's limit; empty without one."""
     return "" if value is None else f", {text(value)} in this container"
 
 
@@ -169,6 +173,7 @@ def _of_proj(part: dict[str, Any]) -> list[str]:
 
 
 def _of_kernels(part: dict[str, Any]) -> list[str]:
+    """Text on the folder of compiled kernels."""
     if part["folder"] is None:
         return ["no folder for them: each run compiles anew"]
     state = f"{part['kernels']} kernels" if part["is_warm"] else "none yet: the first run compiles them, once"

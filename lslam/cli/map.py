@@ -273,6 +273,7 @@ def crispness_rows(score: Crispness | None) -> list[tuple[str, str]]:
 
 
 def _print(rows: list[tuple[str, str]], document: dict[str, Any], as_json: bool) -> None:
+    """Print rows, or with --json the document."""
     if as_json:
         show_json(document)
     else:

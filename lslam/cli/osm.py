@@ -88,6 +88,7 @@ def fetch(out: Path, **given: Any) -> None:
 
 
 def _box(text: str) -> list[float]:
+    """Values of --bbox: south, west, north, east, deg."""
     return options.numbers("--bbox", text, (4,), "S,W,N,E, for example 49.00,8.40,49.01,8.42")
 
 

@@ -133,6 +133,7 @@ class SimulationFile:
 
 
 def _print(results: list[SimulationFile], as_json: bool) -> None:
+    """Print what was written, as lines or as one JSON object."""
     if as_json:
         console.show_json({key: value for one in results for key, value in one.values.items()})
     else:

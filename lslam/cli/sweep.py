@@ -105,6 +105,7 @@ def _sweep(word: str, given: dict[str, Any]) -> Sweep:
 
 
 def _print(rows: list[StudyRow]) -> None:
+    """Print the table of the best result of each method."""
     from lslam.reports.study_table import best_table
     from lslam.reports.text import text_table
 

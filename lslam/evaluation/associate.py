@@ -112,6 +112,7 @@ def _by_index(estimate: Trajectory, truth: Trajectory) -> Matches:
 
 
 def _nearest(estimate: Trajectory, stamps: Stamps, truth: Trajectory, limit: int) -> Matches:
+    """Match poses with the nearest stamps, one to one, within `limit` ns."""
     i, j = nearest_one_to_one(stamps, truth.stamps_ns, limit)
     possible, recipe = min(len(estimate), len(truth)), f"nearest stamp, one to one, within {limit / 1e9:g} s"
     return _matches(estimate.poses[i], truth.poses[j], truth.stamps_ns[j], possible, recipe)
@@ -144,6 +145,7 @@ def _is_denser(truth: Stamps, estimate: Stamps) -> bool:
 
 
 def _matches(estimate: Floats, truth: Floats, stamps: Stamps, possible: int, recipe: str) -> Matches:
+    """Matched poses with seconds since the first; possible : largest number of matches."""
     seconds = np.asarray((stamps - stamps[:1]) / 1e9, np.float64)
     return Matches(estimate, truth, stamps, seconds, possible, recipe)
 

@@ -276,7 +276,10 @@ def plateau(curve: Curve, value: float) -> Floats:
 
 
 def rise_at(curve: Curve, index: int, level: Floats) -> Rise:
-    """Whether the error at a value is worse than a level (S,), m; a value at which most runs are lost is worse."""
+    """Whether the error at the value number `index` is worse than a level (S,), m, of each seed.
+
+    A value at which most runs are lost is worse.
+    """
     if curve.loses_most[index]:
         return "worse"
     ratio = contrast(valid_runs(curve)[index], level)
@@ -385,5 +388,6 @@ def band(law: Law, points: Floats) -> tuple[Floats, Floats]:
 
 
 def _columns(points: Floats) -> Floats:
+    """Points as columns (N, K), also of one parameter."""
     points = np.asarray(points, np.float64)
     return points[:, None] if points.ndim == 1 else points

@@ -122,6 +122,7 @@ def _is_camera(poses: Floats, frame: str) -> bool | None:
 
 
 def _mean_direction(poses: Floats) -> Floats | None:
+    """Mean direction of motion in the body frame, weighted by length; shorter than 1 where it varies. None below 1 m of path."""
     steps = _steps(poses)
     travelled = float(np.linalg.norm(steps, axis=1).sum())
     if travelled < 1.0:
@@ -161,7 +162,7 @@ def body_rotation(estimate: Floats, truth: Floats) -> Floats | None:
 
 
 def _turns(poses: Floats, stride: int) -> Floats:
-    """(M, 3) rotation vectors of the same motions, rad."""
+    """(M, 3) rotation vectors, rad, of the motions from each pose to the one `stride` later."""
     R = so3.normalise(poses[::stride, :3, :3])
     return so3.log(np.swapaxes(R[:-1], -1, -2) @ R[1:])
 
@@ -179,6 +180,7 @@ def _say_difference(out: CommonFrame, way_out: str = "give", addition: str = "")
 
 
 def _turn(poses: Floats) -> Floats:
+    """Poses of a camera (N, 4, 4) in the axes of a vehicle, of body and world: x forward, z up."""
     C = se3.make(R_BODY_CAMERA, np.zeros(3))
     return np.asarray(C @ poses @ C.T)
 
@@ -203,7 +205,7 @@ class BodyTurn:
 
     @property
     def sigma(self) -> float:
-        """One sigma of the angle, rad."""
+        """One standard deviation of the rotation angle, rad."""
         axis = self.rotation / max(self.angle, 1e-12)
         return float(np.sqrt(axis @ self.covariance @ axis))
 
@@ -243,6 +245,7 @@ def body_turn(estimate: Floats, truth: Floats) -> BodyTurn | None:
 
 
 def _state(R: Floats, x: Floats) -> Floats:
+    """The estimate (6,) as a rotation vector, rad, and a lever arm, m; x : the last update of both."""
     return np.concatenate([so3.log(R), x[3:]])
 
 

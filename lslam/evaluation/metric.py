@@ -212,7 +212,7 @@ class TrajectoryMetric(ABC, Generic[Score]):
         """The score of matched poses."""
 
     def of(self, evaluation: Evaluation) -> Score:
-        """Score of this metric in an evaluation."""
+        """The score of this metric in an evaluation."""
         score: Score = evaluation.scores[self.key]
         return score
 
@@ -267,6 +267,7 @@ class TrajectoryMetric(ABC, Generic[Score]):
         return {key: value for key, value in numbers.items() if value is not None}
 
     def _texts(self, e: Evaluation) -> list[tuple[Metric, str]]:
+        """Numbers of the score as texts, each with its metric."""
         score = self.of(e)
         return [(metric, significant(getattr(score, field))) for field, metric in self.columns]
 
@@ -282,7 +283,7 @@ def statistics_document(values: Statistics | None) -> Document:
 
 
 def two(values: object, a: str, b: str) -> str:
-    """Two attributes of statistics as text."""
+    """Attributes `a` and `b` of statistics as text; `n/a` for None."""
     return "n/a" if values is None else f"{significant(getattr(values, a))} / {significant(getattr(values, b))}"
 
 

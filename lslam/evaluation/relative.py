@@ -239,6 +239,7 @@ def _document(error: RelativeError) -> Document:
 
 
 def _sentence(error: RelativeError) -> str:
+    """Error in words: rmse of translation and rotation, pair rule, number of pairs; the note if there are none."""
     if error.translation is None or error.rotation_deg is None:
         return f"{error.name}: {error.note or 'n/a'}"
     return f"{metres(error.translation.rmse)} m, {error.rotation_deg.rmse:.4f} deg rmse ({error.name}, n = {error.n_pairs})"

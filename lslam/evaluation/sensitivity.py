@@ -94,11 +94,13 @@ def judge_imu(finding: ExpectedFinding, result: CurveResult, others: Sequence[Cu
 
 
 def _ratio(upper: Floats, lower: Floats) -> str:
+    """Median over the seeds of `upper` over `lower`, as text."""
     mask = np.isfinite(upper) & np.isfinite(lower) & (lower > 0)
     return f"{np.median(upper[mask] / lower[mask]):.2f}" if mask.any() else "unknown"
 
 
 def _slope(values: Floats, numbers: Floats, mask: Bools) -> float:
+    """Slope of a line through the numbers over the values that `mask` selects."""
     return float(np.polyfit(values[mask], numbers[mask], 1)[0])
 
 
@@ -169,6 +171,7 @@ def _has_errors(curve: Curve) -> bool:
 
 
 def _is_of_time(finding: ExpectedFinding) -> bool:
+    """Whether a finding is about time, so that it needs comparable timings."""
     return finding.kind in (*_LAWS, "acts_only_on") or (finding.kind not in _OF_ERROR and finding.of in _OF_TIME)
 
 

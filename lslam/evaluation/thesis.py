@@ -127,7 +127,7 @@ def planar(estimate: Floats, truth: Floats) -> Planar:
 
 
 def _flatten(poses: Floats) -> Floats:
-    """(N, 3) x, y, yaw."""
+    """(N, 3) x, y (m) and yaw (rad) of poses (N, 4, 4)."""
     yaw = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
     return np.column_stack([poses[:, :2, 3], yaw])
 
@@ -141,15 +141,18 @@ def _relative(a: Floats, b: Floats) -> Floats:
 
 
 def _compose(a: Floats, b: Floats) -> Floats:
+    """SE(2) poses b (N, 3) composed with the pose a (3,) from the left."""
     c, s = np.cos(a[2]), np.sin(a[2])
     return np.stack([a[0] + c * b[:, 0] - s * b[:, 1], a[1] + s * b[:, 0] + c * b[:, 1], a[2] + b[:, 2]], axis=-1)
 
 
 def _rms(values: Floats) -> float:
+    """Root mean square."""
     return float(np.sqrt(np.mean(np.square(values))))
 
 
 def _more(key: str, unit: str) -> Metric:
+    """Metric that only CSV and JSON show."""
     return Metric(key, key, unit, "error", is_main=False)
 
 
@@ -263,6 +266,7 @@ class DelTufo(TrajectoryMetric[Planar]):
 
 
 def _join(values: Sequence[float]) -> str:
+    """Numbers as text with slashes between."""
     return " / ".join(significant(value) for value in values)
 
 

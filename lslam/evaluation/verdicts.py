@@ -160,10 +160,12 @@ def _changes(curve: Curve) -> tuple[dict[str, float], float | None]:
 
 
 def _own_share(finding: ExpectedFinding, change: dict[str, float]) -> float:
+    """Share of the change of all stages that the stages of the finding have."""
     return sum(change.get(name, 0.0) for name in finding.stages) / sum(change.values())
 
 
 def _value_list(curve: Curve, which: Bools) -> str:
+    """Values of the curve that `which` selects, as text."""
     return ", ".join(curve.name_of(value) for value in curve.values[which])
 
 
@@ -375,10 +377,12 @@ def _rise_before(curve: Curve, values: Floats, place: int) -> Rise:
 
 
 def _only_if_as_good(rise: Rise) -> Outcome:
+    """`refuted` if lower values are as good, else `undecided`."""
     return "refuted" if rise == "as good" else "undecided"
 
 
 def _elbow(result: CurveResult) -> float | None:
+    """Value from which the median error of a curve is on its plateau; None without one."""
     return elbow(result.curve.values, result.medians["translation"], result.curve.loses_most)
 
 

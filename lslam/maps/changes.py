@@ -96,10 +96,10 @@ class ChangedCells:
 
 @dataclass(frozen=True)
 class _Drive:
-    """Cell keys of one drive by state; each array is sorted.
+    """Sorted keys of one drive's cells, by state.
 
-    seen : all; occupied : in the end, and in the sum; certain : those of them beyond doubt; free : beyond doubt; solid : in
-        the end or in the sum
+    seen : observed; occupied : in the end state and in the sum; certain : of these, those beyond doubt
+    free : free beyond doubt; solid : occupied in the end state or in the sum
     """
 
     seen: Keys
@@ -158,7 +158,7 @@ def differences(evidence: Evidence, cloud: Floats) -> tuple[MapChange, ...]:
 
 
 def _squares(cells: Longs) -> Longs:
-    """Number of the square, seen from above, of each cell (M, 3)."""
+    """Number (M,) of the square in the x-y plane that each cell (M, 3) lies in; one square holds many cells."""
     x, y = (cells[:, :2] // KNOWN_CELLS).T
     return np.asarray((x << 32) + y)
 
@@ -196,7 +196,7 @@ def _drive(evidence: Evidence) -> _Drive:
 
 
 def _things(kind: Kind, here: _Drive, there: _Drive, evidence: Evidence) -> list[MapChange]:
-    """Connected cells that are occupied here and free there, as objects, the largest first."""
+    """Connected cells that are occupied in the drive `here` and free in the drive `there`, as objects, the largest first."""
     passed = here.occupied[_among(here.occupied, there.free)]
     alone = passed[~_beside(passed, there.solid) & _open(passed, there.seen)]
     cells = passed[_beside(passed, alone)]
@@ -253,6 +253,7 @@ def _steps() -> list[int]:
 
 
 def _among(keys: Keys, others: Keys) -> Bools:
+    """Mask of the keys that are among `others`, which are sorted."""
     return np.asarray(_indices_of(keys, others) >= 0)
 
 
@@ -265,6 +266,7 @@ def _indices_of(keys: Keys, others: Keys) -> Longs:
 
 
 def _cells(keys: Keys, evidence: Evidence) -> Longs:
+    """Cell indices (M, 3) of keys (M,)."""
     from lslam.maps.kernels.cells import unpack_cells
 
     return unpack_cells(keys, evidence.origin)

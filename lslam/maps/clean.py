@@ -92,7 +92,10 @@ def label_objects(points: NDArray[np.float32], subset: Bools) -> Longs:
 
 
 def whole(moves: Bools, labels: Longs, share: float, least: int) -> Bools:
-    """Mask (N,) extended to all points of objects of which at least the share `share` and `least` points are masked."""
+    """Mask `moves` (N,) extended to all points of objects of which at least a `share` and at least `least` points are masked.
+
+    labels : (N,) object of each point, 0 for none
+    """
     total, moving = np.bincount(labels), np.bincount(labels, moves)
     subset = (moving >= least) & (moving >= share * total)
     subset[:1] = False  # 0 is no thing
@@ -144,7 +147,7 @@ class PosedScan:
     observations: Observations | None = None
 
     def select(self, mask: NDArray[Any]) -> PosedScan:
-        """The points that `mask` (bool or indices) keeps, with all that is known of them."""
+        """The points that `mask` (bool or indices) keeps, with their intensity and observations."""
         return replace(
             self,
             points=self.points[mask],
@@ -193,7 +196,7 @@ class Cleaner:
         self.removed = self.seen = 0
 
     def add(self, scan: PosedScan) -> list[PosedScan]:
-        """Add a scan. Returns the scans that can be decided now."""
+        """Add the next scan. Returns the cleaned scans that are decided with it: those with all scans around them."""
         from lslam.maps.kernels.views import nearest_ranges
 
         points = np.ascontiguousarray(scan.points, np.float32)
@@ -213,7 +216,7 @@ class Cleaner:
         return self._decide() if self._count - self._decided > OFFSETS[-1] else []
 
     def finish(self) -> list[PosedScan]:
-        """Remaining scans, after the last one."""
+        """The cleaned scans that remain after the last one was added."""
         return [scan for _ in checking(range(self._count - self._decided)) for scan in self._decide()]
 
     def state(self) -> State:
@@ -232,7 +235,7 @@ class Cleaner:
         return self._count
 
     def _decide(self) -> list[PosedScan]:
-        """Oldest scan without its moving points; empty when it came out before."""
+        """Oldest undecided scan without its moving points, in a list; empty if an earlier part of the run delivered it."""
         scan, number = self._scans.popleft(), self._decided
         moves = None if number < self._known else self._moves(scan, number)
         self._decided += 1

@@ -61,9 +61,9 @@ def plane_variances(points: Floats, queries: Floats) -> Floats:
 
 
 def _slabs(cloud: Cloud, radius: float, step: int) -> Iterator[tuple[Floats, Floats]]:
-    """Pairs of points (N, 3), m, of a slab in x, and every `step`-th of them (M, 3), whose spheres of `radius`, m, it covers.
+    """Slabs of the cloud in x: points (N, 3), m, and queries (M, 3), every `step`-th point, whose neighbours they contain.
 
-    Each of these is in one pair only.
+    Neighbours lie within `radius`, m. Each query is in one slab only.
     """
     if not isinstance(cloud, MergedMap):
         points = in_memory(cloud).points

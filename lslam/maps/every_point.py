@@ -129,7 +129,7 @@ class PointCollector:
         return EveryPointMap(self._path, self._owner, self._record, self._count, has_intensity, types)
 
     def state(self) -> State:
-        """State for `restore`; the points are in `keep`."""
+        """What `restore` needs, for a checkpoint: the number of points in the file in `keep`."""
         counts = (self.scans, self.gated, self._count, self._last_scan)
         return {"has_intensity": self._has_intensity, "counts": counts}
 

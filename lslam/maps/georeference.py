@@ -50,11 +50,11 @@ class LocalFrame:
     heights = "heights above the first pose of the sensor"
 
     def apply(self, points: NDArray[Any]) -> Floats:
-        """The points (N, 3), m."""
+        """The points (N, 3), m, unchanged."""
         return np.asarray(points, np.float64).reshape(-1, 3)
 
     def carry(self, poses: NDArray[Any]) -> Floats:
-        """The poses (N, 4, 4), m."""
+        """The poses (N, 4, 4), m, unchanged."""
         return np.asarray(poses, np.float64).reshape(-1, 4, 4)
 
 
@@ -110,7 +110,7 @@ class Projection:
 
     @property
     def attribution(self) -> str:
-        """What a map placed by data of others has to say."""
+        """Credit that a map must carry if data of others placed it on the Earth; else empty."""
         is_theirs = self.georeference.method == "osm"
         return "placed by buildings, © OpenStreetMap contributors, ODbL 1.0" if is_theirs else ""
 
@@ -206,6 +206,7 @@ class Projection:
 
     @cached_property
     def _transformer(self) -> Any:
+        """pyproj's transformer from the local frame, or WGS 84 with heights, to the projected coordinates."""
         if self._is_vertical:
             return exact_transformer("EPSG:4979", self._crs, self.georeference.origin[:2], self.name)
         return exact_transformer(
@@ -284,11 +285,13 @@ def to_wgs84(points: NDArray[Any], epsg: int, height_epsg: int | None = None, ge
 
 
 def _transform(transformer: Any, points: Floats) -> Floats:
+    """Transform points (N, 3) by pyproj's transformer to (N, 3) lat, lon (deg), height (m)."""
     lon, lat, height = transformer.transform(points[:, 0], points[:, 1], points[:, 2])
     return np.column_stack([lat, lon, height])
 
 
 def _require_places(points: Floats, places: Floats, crs: Any, epsg: int) -> None:
+    """Raise UsageError naming the first of `points` whose `places` (N, 3) lat, lon, height are not on the Earth."""
     wrong = np.flatnonzero(~(np.isfinite(places).all(1) & (np.abs(places[:, 0]) <= 90) & (np.abs(places[:, 1]) <= 360)))
     if len(wrong):
         x, y, _ = points[wrong[0]]
@@ -296,4 +299,5 @@ def _require_places(points: Floats, places: Floats, crs: Any, epsg: int) -> None
 
 
 def _without_epsg(georeference: Georeference) -> Georeference:
+    """The georeference without the coordinate systems of the outputs."""
     return Georeference(georeference.origin, georeference.T_enu_world)

@@ -82,6 +82,7 @@ class MergedMap:
             yield CloudBlock(unpack(rows, self._origin, self.voxel), intensity, columns)
 
     def _pieces(self) -> Iterator[Longs]:
+        """Rows of the voxels, `BLOCK` at a time."""
         for start in checking(range(0, len(self), BLOCK)):
             stop = min(start + BLOCK, len(self))
             yield self._rows.read(start, stop) if isinstance(self._rows, StoredRows) else self._rows[start:stop]
@@ -178,7 +179,7 @@ class MapMerger:
         intensity: NDArray[Any] | None = None,
         observations: Observations | None = None,
     ) -> ScanSums:
-        """First half of `add`, for one other thread, which sums up scan after scan while earlier ones are added."""
+        """Sum up the points of a scan per voxel, the first half of `add`; one other thread may call it while scans are added."""
         from lslam.maps.kernels.cells import sum_up
 
         T = np.ascontiguousarray(T_world_lidar, np.float64)
@@ -204,7 +205,7 @@ class MapMerger:
         return ScanSums(rows, count, has_intensity, gated, outside, scan)
 
     def add_sums(self, sums: ScanSums) -> None:
-        """Second half of `add`."""
+        """Add the sums of a scan to the map, the second half of `add`."""
         from lslam.maps.kernels.cells import add_rows
 
         if sums.rows is None:
@@ -227,7 +228,7 @@ class MapMerger:
         self._spare.append(sums.rows)
 
     def result(self) -> MergedMap:
-        """The map of all scans, sorted by voxel: the same scans give the same bytes. The merger is empty then."""
+        """The map of all scans, sorted by voxel: the same scans give the same bytes. Afterwards the merger is empty."""
         if self.outside:
             log.warning(
                 "merged map: %d points lie more than %.0f km from the first scan and are left out",
@@ -256,6 +257,7 @@ class MapMerger:
             self._table.set_columns(self._base + self._with_intensity)
 
     def _settle_intensity(self, has_intensity: bool) -> None:
+        """Keep the column of intensity only if every scan so far has it."""
         if self._with_intensity and not has_intensity:
             log.warning("merged map: a scan has no intensity, so the map has none")
         if self._with_intensity is None or (self._with_intensity and not has_intensity):

@@ -78,4 +78,5 @@ def surface(cloud: ArrayCloud, voxel: float, viewpoints: NDArray[Any]) -> Mesh:
 
 
 def _points(package: Any, cloud: ArrayCloud) -> Any:
+    """Open3D's point cloud of the points."""
     return package.geometry.PointCloud(package.utility.Vector3dVector(cloud.points))

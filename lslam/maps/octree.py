@@ -88,7 +88,7 @@ def points_of(name: str, data: bytes, tree: Mapping[str, Any]) -> Floats:
 
 
 def _records(block: CloudBlock, kind: np.dtype[Any], low: Floats, shades: tuple[float, float]) -> Records:
-    """The finite points of a block, from the lowest corner of the cube."""
+    """The finite points of a block as records, coordinates relative to the lowest corner `low` (3,) of the root cube."""
     finite = np.isfinite(block.points).all(1)
     records = np.zeros(int(finite.sum()), kind)
     records["at"] = block.points[finite] - low
@@ -170,7 +170,10 @@ class _Builder:
 
 
 def _sorted_out(records: Records, low: Floats, edge: float) -> Iterator[tuple[Records, Records, NDArray[Any]]]:
-    """Block by block: first records of the cells of a cube (`low` (3,), `edge` m), the others, and these ones' child number."""
+    """Divide the records of a cube (`low` (3,), `edge`, m), block by block: first of each cell, the others, and their children.
+
+    The third array is the child number of each of the others.
+    """
     is_taken = np.zeros(CELLS**3, bool)
     for begin in range(0, len(records), BLOCK):
         block = np.asarray(records[begin : begin + BLOCK])

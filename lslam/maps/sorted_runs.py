@@ -52,14 +52,14 @@ class SortedRuns:
         return len(self._runs)
 
     def add(self, rows: Rows) -> None:
-        """Store a run."""
+        """Store sorted rows (n, k) as one run."""
         stored = self._rows_file(f"run-{len(self._runs)}", rows.shape[1])
         stored.remove()  # what a process that was killed may have left
         stored.append(rows)
         self._runs.append(stored)
 
     def state(self) -> State:
-        """State with which `restore` finds the runs again."""
+        """Numbers of rows and columns of each run, by which `restore` finds them in the folder."""
         return {"runs": [(len(run), run.columns) for run in self._runs]}
 
     def restore(self, state: State) -> None:
@@ -71,6 +71,7 @@ class SortedRuns:
             self._runs.append(stored)
 
     def _rows_file(self, name: str, columns: int) -> StoredRows:
+        """A new file for rows in the folder."""
         return StoredRows(self._folder / name, columns, self._owner)
 
     def merge(self, combine: Combine) -> StoredRows:
@@ -143,7 +144,7 @@ class StoredRows:
         return bisect_left(self.keys, key)
 
     def find(self, count: int) -> None:
-        """Take over `count` existing rows. Raises InputError when there are fewer."""
+        """Take over `count` rows of an existing file. Raises InputError when there are fewer."""
         for path, columns in ((self._path, self.columns), (self._path.with_suffix(".keys"), 1)):
             if not path.is_file() or path.stat().st_size < 8 * columns * count:
                 raise InputError(f"{path} does not hold the {count} rows that it should")

@@ -190,7 +190,7 @@ class OsmBuffer:
         buildings_of(from_overpass(reply), self._origin, "the reply")
 
     def _keep(self, circle: _Circle, folder: Path) -> None:
-        """Write the reply of a circle to `folder`, unless the buildings were handed out already."""
+        """Write the reply of a circle as the next file in `folder`."""
         folder.mkdir(parents=True, exist_ok=True)
         requested = {"lslam_centre": circle.request.centre.tolist(), "lslam_radius": circle.request.radius}
         with atomic_write(folder / f"{len(self.replies):06d}.json") as stream:

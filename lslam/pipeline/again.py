@@ -176,7 +176,10 @@ def _content(file: Path) -> bytes:
 
 
 def open_again(run: EarlierRun, sequence: Path | None = None, **reading: Any) -> Sequence:
-    """Recording of the run and the streams it needs; `reading` overrides the run's options. InputError if it is gone."""
+    """Open the recording of the run, with the streams it needs. Raises InputError if the recording is missing.
+
+    sequence : its new place, if it moved; reading : options of `open_sequence` that override the run's
+    """
     return open_recording(recording_of(run, sequence), run.config, **reading_of(run, sequence, **reading))
 
 

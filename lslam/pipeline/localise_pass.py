@@ -264,7 +264,10 @@ def _deliver(job: PreparedRun, record: RunRecord, prior_map: PriorMap, fixes: li
 
 
 def _tell(record: RunRecord, prior_map: PriorMap, start: dict[str, Any], config: Config, manifest: Manifest) -> None:
-    """Write counts and problems of the scans' registration on the map into the manifest."""
+    """Write the counts and problems of localisation into the manifest.
+
+    start : facts about the located start
+    """
     fixes = record.map_fixes
     counts = Counter[str](fix.status for fix in fixes)
     doubtful = sum(fix.is_doubtful for fix in fixes)

@@ -135,7 +135,7 @@ class Manifest:
             )
 
     def take_over(self, record: RunRecord) -> None:
-        """Add problems of the result."""
+        """Add the problems of the record, and the reason why known ground truth gave no score."""
         self.problems += record.problems
         self.unscored = record.no_score_reason
 
@@ -254,6 +254,7 @@ def peak_memory_mb() -> float | None:
 
 @cache
 def _code_digest() -> str:
+    """Digest of the source files of lslam."""
     digest, package = hashlib.sha256(), Path(__file__).parents[1]
     for path in sorted(package.rglob("*.py")):
         digest.update(path.read_bytes())
@@ -262,6 +263,7 @@ def _code_digest() -> str:
 
 @cache
 def _version(name: str) -> str | None:
+    """Version of an installed package; None where it is missing."""
     try:
         return version(name)
     except PackageNotFoundError:

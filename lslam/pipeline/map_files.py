@@ -94,11 +94,13 @@ def _notes(path: Path) -> dict[str, Note]:
 
 
 def _is_of(path: Path, name: str) -> bool:
+    """Whether `name` is that of a map with the stem of `path`."""
     other = Path(name)
     return other.name == name and other.stem == path.stem and other.suffix.lower() in MAP_SUFFIXES
 
 
 def _join(notes: dict[str, Note]) -> Note:
+    """The first note with all others under `others`."""
     first, *others = notes
     return notes[first] | ({"others": {name: notes[name] for name in others}} if others else {})
 

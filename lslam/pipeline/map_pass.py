@@ -187,7 +187,7 @@ class MapMaker:
         self._numbers: list[int] = []
 
     def sum_up(self, scan: PosedScan) -> ScanSums | None:
-        """Half of the work on a scan, for the thread that reads; None where it cannot be parted."""
+        """Sum up the points of a scan, which the reading thread can do; None where cleaning must come first."""
         if self._cleaner is not None or not isinstance(self._merger, MapMerger):
             return None
         return self._merger.sum_up(scan.points, scan.T_world_lidar, scan.intensity, scan.observations)
@@ -236,6 +236,7 @@ class MapMaker:
         return self._numbers[-1] + 1 if self._numbers else 0
 
     def _merge(self, scans: Iterable[PosedScan], sums: ScanSums | None = None) -> None:
+        """Add cleaned scans to the map, and to the occupancy if there is one; sums : of the one scan, if known."""
         for posed in scans:
             if sums is not None and isinstance(self._merger, MapMerger):
                 self._merger.add_sums(sums)
@@ -325,10 +326,12 @@ class MapCheckpoints:
 def begin_pass(
     checkpoints: MapCheckpoints | None, make: Callable[[Path | None], M], poses: Floats
 ) -> tuple[M, int, Offer | None]:
-    """What a pass over scans at `poses` (N, 4, 4) begins with: its builder, the number of scans that this has taken already,
-    and a function that offers it a checkpoint.
+    """What a pass over scans at `poses` (N, 4, 4) begins with.
 
-    make : new builder, by the folder for its voxels, None where it needs none
+    make : creates the builder, by the folder for its voxels, None where it needs none
+
+    Returns the builder, from a checkpoint if there is one, the number of scans that are in it, and a function that offers it
+    checkpoints.
     """
     if checkpoints is None:
         return make(None), 0, None

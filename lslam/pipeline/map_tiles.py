@@ -178,6 +178,7 @@ def _spill(waiting: dict[tuple[int, int], list[NDArray[Any]]], spool: Path) -> s
 
 
 def _part(spool: Path, key: tuple[int, int]) -> Path:
+    """File for the buffered points of a tile."""
     return spool / f"{key[0]}_{key[1]}.points"
 
 
@@ -242,6 +243,7 @@ def vpc_item(name: str, tile: ArrayCloud, projection: Projection) -> dict[str, A
 
 
 def _schema(name: str, kind: np.dtype[Any]) -> Mapping[str, Any]:
+    """Description of a column for a STAC item."""
     return {"name": name, "size": kind.itemsize, "type": _KINDS[kind.kind]}
 
 

@@ -234,6 +234,7 @@ def _ate(
 
 
 def _line(row: SessionRow) -> str:
+    """Line of sessions.csv."""
     before, after = ("", "") if row.ate is None else (f"{row.ate[0]:.5f}", f"{row.ate[1]:.5f}")
     run = f'"{row.run}"' if "," in row.run else row.run
     values = (row.name, run, row.scans, row.keyframes, row.first_keyframe, row.votes, row.tried, row.loops_between)

@@ -154,6 +154,7 @@ def _begin_segment(job: PreparedRun, inertial: Inertial) -> Begin | None:
 
 
 def _stationary(config: Config) -> StationaryDetector | None:
+    """The stationary detector, if it is configured; else None."""
     is_on = config.preprocess.skip_standing
     return StationaryDetector(config.preprocess, config.registration) if is_on else None
 

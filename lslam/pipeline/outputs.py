@@ -79,6 +79,7 @@ def _sigmas(candidate: LoopCandidate) -> tuple[float, float]:
 
 
 def _number(value: float) -> str:
+    """A number with 4 decimals; empty if it is not finite."""
     return f"{value:.4f}" if np.isfinite(value) else ""
 
 
@@ -114,6 +115,7 @@ def _match_row(
 
 
 def _write(path: Path, columns: str, rows: Iterable[Sequence[Any]]) -> None:
+    """Write a CSV table; columns : their names, separated by commas. Raises OutputError."""
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows([columns.split(","), *rows])
     write_text(path, text.getvalue())

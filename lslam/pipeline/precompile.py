@@ -65,6 +65,7 @@ def _last_of_method(config: Config) -> None:
 
 
 def _loops(config: Config) -> None:
+    """Compile or load the kernels of loop detection."""
     from lslam.backend.loops import find_loops
 
     find_loops.warm_up(config.loops)

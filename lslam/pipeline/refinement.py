@@ -149,7 +149,7 @@ def _adjustment(
     keyframes: Longs,
     prior_map: Floats | None,
 ) -> tuple[dict[str, Any], list[list[ScanResult]] | None]:
-    """As `refine`, of the points that were read of the drives, which are moved."""
+    """As `refine`, from points that were read already; the points of `cloud` are moved."""
     nodes = [drive.nodes for drive in drives]
     firsts = np.cumsum([0, *map(len, nodes)])
     count = int(firsts[-1])
@@ -200,7 +200,7 @@ def _adjustment(
 
 
 def _checkerboard(points: Floats) -> Bools:
-    """(N,) whether each point (N, 3) lies in one of every second cell."""
+    """Mask (N,) of the points (N, 3), m, in every second cell of a grid, like the black fields of a checkerboard."""
     total = np.zeros(len(points), np.int64)
     for axis in range(3):
         total += np.floor(points[:, axis] / CELL_M).astype(np.int64)
@@ -236,5 +236,5 @@ def thinner_windows(gain: Floats, scans: Longs, cells: Longs, count: int) -> Boo
 
 
 def _thickness_mm(variances: Floats) -> float:
-    """The geometric mean of the thickness."""
+    """Geometric mean of the thickness of planes, mm, from their variances, m2."""
     return round(1e3 * float(np.exp(0.5 * np.log(np.maximum(variances, 1e-12)).mean())), 1)

@@ -152,6 +152,7 @@ class RunFolder:
             self.path.rmdir()  # only when it is empty
 
     def _let_go(self) -> None:
+        """Remove the lock file and release the lock."""
         if self._lock is not None:
             with contextlib.suppress(OSError):
                 (self.path / LOCK).unlink(missing_ok=True)
@@ -273,10 +274,12 @@ def _require_free(path: Path, overwrite: bool) -> None:
 
 
 def _in_use(path: Path) -> OutputExistsError:
+    """The error about a folder that another process has locked."""
     return OutputExistsError(f"output folder {path} is in use by another run; name another with --out")
 
 
 def _is_in_use(path: Path) -> bool:
+    """Whether another process has locked the folder."""
     try:
         with (path / LOCK).open("r") as stream:
             return not lock(stream)
@@ -315,6 +318,7 @@ def lock_folder(path: Path) -> Iterator[None]:
 
 
 def _clear_spools(path: Path) -> None:
+    """Delete temporary folders that a killed process left in a run folder."""
     for folder in path.glob(f"{SPOOL}*"):
         shutil.rmtree(folder, ignore_errors=True)
 
@@ -376,4 +380,5 @@ def upload(folder: Path, place: RemotePath) -> None:
 
 
 def _is_result(path: Path) -> bool:
+    """Whether a file of a run folder is a result, to be uploaded."""
     return path.name != LOCK and path.suffix != ".part" and path.parts[0] != CHECKPOINT

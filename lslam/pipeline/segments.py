@@ -216,7 +216,10 @@ def _move(result: ScanResult, T: Floats, origin: Floats, base: Floats) -> ScanRe
 
 
 def _report(sentences: list[str], manifest: Manifest, others: str) -> None:
-    """Add the first sentences to the problems of the run, and a last one about the `others`, which says where they are."""
+    """Add the first few sentences to the problems of the run, and one that counts the rest.
+
+    others : end of that last sentence, which says where the rest are
+    """
     if (more := len(sentences) - MAX_SENTENCES) > 0:
         sentences = [*sentences[:MAX_SENTENCES], f"and {more} more {others}"]
     for sentence in sentences:
@@ -285,7 +288,7 @@ def _check_stamps(results: list[ScanResult], positions: Floats, stamps_ns: Longs
 
 
 def _positions(results: list[ScanResult]) -> tuple[Floats, Longs, Longs]:
-    """(N, 3) m, at stamps (N,), ns, in frames (N,)."""
+    """Positions (N, 3), m, stamps (N,), ns, and numbers of the frame (N,) of the results."""
     positions = np.stack([r.at_stamp.T_world_lidar[:3, 3] for r in results])
     return positions, np.array([r.stamp_ns for r in results]), np.array([r.frame for r in results], np.int64)
 

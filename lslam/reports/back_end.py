@@ -156,6 +156,7 @@ def before_and_after(after: Evaluation, before: Evaluation, what: str = "the pos
 
 
 def _common_alignment(after: Evaluation, before: Evaluation) -> str | None:
+    """Name of the first alignment that both evaluations have; None without one."""
     for name, error in after.ate.items():
         other = before.ate.get(name)
         if error.translation is not None and other is not None and other.translation is not None:
@@ -244,12 +245,12 @@ WORDS = {"gone": "gone", "appeared": "not in the map"}
 
 
 def state_of(fix: MapFix) -> str:
-    """Key of `STATES` of a scan."""
+    """State of a scan against the map: one of the keys of `STATES`."""
     return "doubted" if fix.is_binding and fix.is_doubtful else fix.status
 
 
 def state_codes(record: RunRecord) -> NDArray[np.uint8]:
-    """(N,) place in `STATES` of each scan against the map."""
+    """(N,) index in `STATES` of each scan's state against the map."""
     names = list(STATES)
     return np.array([names.index(state_of(fix)) for fix in record.map_fixes], np.uint8)
 

@@ -143,7 +143,7 @@ def _row(correction: BuildingCorrection) -> tuple[str, ...]:
 
 
 def _holds(matches: OsmMatches, poses: Floats) -> Figure:
-    """Figure of the parts of the path, `poses` (K, 3), where the map constrained the trajectory."""
+    """Figure of the path, `poses` (K, 3), with the parts where the map constrained the trajectory."""
     at = {match.keyframe: match for match in matches.keyframes}
     used = np.array([k for k, match in at.items() if match.is_accepted], np.intp)
     kinds = [
@@ -161,7 +161,7 @@ def _holds(matches: OsmMatches, poses: Floats) -> Figure:
 
 
 def _dots(xy: Floats) -> Floats:
-    """Points that are drawn without connecting lines."""
+    """Positions (K, 2) with NaN rows between, so that a chart draws points without connecting lines."""
     return np.stack([xy, np.full_like(xy, np.nan)], axis=1).reshape(-1, 2)
 
 
@@ -174,10 +174,12 @@ def _seen_walls(sights: Sequence[KeyframeMatch], poses: Floats) -> Floats:
 
 
 def _segments(walls: Floats) -> list[Floats]:
+    """Walls (S, 2, 2) as lines."""
     return [np.asarray(wall) for wall in walls]
 
 
 def _outlines(buildings: Iterable[Building]) -> list[Floats]:
+    """Closed outlines of the buildings, holes included."""
     rings = (ring for building in buildings for footprint in building.footprints for ring in footprint.rings)
     return [np.concatenate([ring, ring[:1]]) for ring in rings]
 

@@ -172,14 +172,17 @@ def _tracks(drawing: Drawing, methods: Sequence[str]) -> list[Track]:
 
 
 def _named_tracks(names: Sequence[str], positions: Sequence[Floats], among: Sequence[str]) -> list[Track]:
+    """Tracks from above of positions (N, 3), each with its name and the style of that name among `among`."""
     return [Track(name, p[:, :2], style_of(name, among)) for name, p in zip(names, positions, strict=True)]
 
 
 def _tracks_on_map(view: TopView, tracks: list[Track], about: str) -> MapFigure | None:
+    """Figure of tracks over a map from above; about : sentence on the frame."""
     return map_figure(view.image, view.heights, view.extent, tracks, legend_of(tracks), about)
 
 
 def _plan(title: str, tracks: list[Track], caption: str = "", spoken: str = "") -> Figure:
+    """Figure of tracks from above; spoken : title for screen readers, if another."""
     return Figure(title, plane_chart(tracks, spoken or title.lower()), legend_of(tracks), caption)
 
 
@@ -268,6 +271,7 @@ def _cloud(run: DrawnRun) -> Floats | None:
 
 
 def _bar_label(method: str, runs: Sequence[RunScore]) -> str:
+    """Text of a bar: method, mean and 95th percentile of the time per scan."""
     mark = "~" if any(run.jobs > 1 for run in runs) else ""
     keys = ("time.mean", "time.p95")
     mean, p95 = (float(np.mean([run.values[key] for run in runs if key in run.values])) for key in keys)
@@ -315,6 +319,7 @@ def _bars(bars: Sequence[tuple[str, dict[str, float]]], stages: Sequence[str], l
 
 
 def _sentence(text: str) -> str:
+    """Text as a sentence: with a capital and a full stop."""
     return f"{text[0].upper()}{text[1:]}."
 
 

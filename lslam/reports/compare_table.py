@@ -173,6 +173,7 @@ def _health(row: SummaryRow) -> str:
 
 
 def _usable(row: SummaryRow) -> str:
+    """Text of how many runs are usable."""
     doubted = f", {row.degraded} degraded" if row.degraded else ""
     return f"{row.runs - row.failed}/{row.runs}{doubted}"
 
@@ -200,6 +201,7 @@ def _pairs(comparison: Comparison) -> CompareTable:
 
 
 def _differences(comparison: Comparison) -> CompareTable:
+    """Table of the distances between trajectories, without ground truth."""
     rows = []
     for d in comparison.differences:
         rows.append((d.sequence, d.method, d.reference, str(d.seed), metres(d.origin), metres(d.se3)))
@@ -208,7 +210,7 @@ def _differences(comparison: Comparison) -> CompareTable:
 
 
 def _runs_table(runs: Sequence[RunScore], what: str, *names: str) -> CompareTable:
-    """These fields of some runs."""
+    """Table of the runs, with these fields (`names`) of each; what : its title."""
     rows = tuple(tuple(str(getattr(run, name)) for name in names) for run in runs)
     header = tuple("outcome" if name == "status" else name for name in names)
     return CompareTable(f"{count_of(len(rows), 'run')} {what}", header, rows, len(names))
@@ -262,6 +264,7 @@ def write_result(path: Path, comparison: Comparison) -> None:
 
 
 def _head(command: str, status: str) -> dict[str, Any]:
+    """Entries with which compare.json begins."""
     return {"schema": SCHEMA, "version": VERSION, "lslam": __version__, "status": status, "command": command}
 
 
@@ -276,5 +279,6 @@ def _run(run: RunScore) -> dict[str, Any]:
 
 
 def _write(path: Path, document: dict[str, Any]) -> None:
+    """Write a document as JSON, atomically."""
     text = json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False)
     write_text(path, text + "\n")

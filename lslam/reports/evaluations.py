@@ -149,6 +149,7 @@ def _recipes(evaluations: Sequence[Evaluation]) -> list[str]:
 
 
 def _text(rows: list[MetricRow], names: list[str]) -> list[str]:
+    """Lines of a table of metric rows; names : of the estimates."""
     grid = [[f"  {row.label}" if row.under else row.label, row.unit, *row.cells] for row in rows]
     lines = text_table([["", "", *names], *grid], 2).split("\n")
     return lines if len(names) > 1 else lines[1:]

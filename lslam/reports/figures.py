@@ -69,6 +69,7 @@ def draw_figure(run: PlottedRun, what: str, width: float = WIDTHS["column"]) -> 
 
 
 def _map(figure: Any, run: PlottedRun) -> None:
+    """Draw the map by height with the trajectory."""
     plot = figure.add_subplot()
     seen = _points(plot, run)
     figure.colorbar(seen, ax=plot, label="height, m", shrink=0.7)
@@ -239,14 +240,17 @@ def _about(plot: Any, points: Floats) -> None:
 
 
 def _some(points: NDArray[Any]) -> NDArray[Any]:
+    """Every n-th point, so that a figure has no more than `MOST`."""
     return points[:: max(1, -(-len(points) // MOST))]
 
 
 def _line(plot: Any, positions: NDArray[Any], colour: str, name: str) -> None:
+    """Draw positions (N, 3) from above as a line."""
     plot.plot(positions[:, 0], positions[:, 1], color=colour, lw=0.8, label=name)
 
 
 def _from_above(plot: Any, x: str = "x, m", y: str = "y, m") -> None:
+    """Set equal scales and labels of a plot from above."""
     plot.set_aspect("equal", adjustable="datalim")
     label(plot, x, y)
 

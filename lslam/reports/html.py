@@ -80,6 +80,7 @@ def imu_figures(record: RunRecord) -> list[Figure]:
 
 
 def _course(course: _Course, seconds: Floats, values: Floats, sigmas: Floats) -> Figure:
+    """Figure of some IMU states over time, with bands."""
     lines, reach = numbered_lines(course.names, seconds, values.T), BAND_SIGMAS * sigmas.T
     bands = [svg.Band(line.x, line.y - r, line.y + r, line.style) for line, r in zip(lines, reach, strict=True)]
     caption, legend = f"{course.recipe} Band: {BAND_SIGMAS:g} sigma.".strip(), None if len(lines) > 1 else ()
@@ -106,6 +107,7 @@ def _readings(record: RunRecord) -> list[Figure]:
 
 
 def _seconds(stamps_ns: Longs, record: RunRecord) -> Floats:
+    """Time since the run's first scan, s."""
     return np.asarray((stamps_ns - record.results[0].stamp_ns) * 1e-9)
 
 
@@ -217,6 +219,7 @@ def flatten(tree: Mapping[str, Any], prefix: str = "") -> list[tuple[str, list[s
 
 
 def _plain(value: Any) -> str:
+    """Value as text for the page."""
     if isinstance(value, bool):
         return "yes" if value else "no"
     return f"{value:.6g}" if isinstance(value, float) else str(value)

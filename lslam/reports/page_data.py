@@ -210,7 +210,7 @@ def _nearest(points: Floats, positions: Floats) -> NDArray[np.intp]:
 
 
 def _by_pose(trajectory: Trajectory, results: list[ScanResult]) -> list[ScanResult | None]:
-    """Scan result of each pose."""
+    """Scan result of each pose of the trajectory; None where there is none."""
     at = {r.stamp_ns: r for r in results}
     return [at.get(stamp) for stamp in trajectory.stamps_ns.tolist()]
 
@@ -226,6 +226,7 @@ def _pose_indices(trajectory: Trajectory, evaluation: Evaluation) -> NDArray[np.
 
 
 def _status(result: ScanResult | None) -> int:
+    """Code of a scan's result for the script: its word in `STATUSES` and flags."""
     if result is None:
         return STATUSES.index("not known")
     word = "standing" if result.is_stationary else "registered" if result.status == "ok" else result.status
@@ -335,6 +336,7 @@ def feature_figures(view: FeatureView | None) -> list[Figure]:
 
 
 def _backdrop(points: Floats, crop: Crop) -> tuple[str, tuple[float, float, float, float]]:
+    """Image of points from above as a data URI, and its extent, m."""
     (image,), top = crop_images([points], crop)
     assert image is not None
     return data_uri(density_png(image, top)), crop.extent

@@ -141,6 +141,7 @@ def _trajectories(
 
 
 def _axis_errors(plot: Any, evaluation: Evaluation, name: str) -> None:
+    """Plot the errors per axis over distance."""
     for k, axis in enumerate("xyz"):
         plot.plot(evaluation.distance, evaluation.scores["thesis1"].xyz[:, k], lw=1.0, color=COLOURS[k], label=axis)
     plot.legend(loc="best", ncol=3, frameon=False)
@@ -178,6 +179,7 @@ def _best_alignment(evaluation: Evaluation) -> AbsoluteError:
 
 
 def _colours(count: int) -> list[str]:
+    """Colours of so many lines."""
     return [COLOURS[k % len(COLOURS)] for k in range(count)]
 
 
@@ -219,6 +221,7 @@ def write_buildings_png(path: Path, extract: BuildingExtract) -> None:
 
 
 def _outline(rings: tuple[Floats, ...]) -> Any:
+    """matplotlib path of a polygon with its holes."""
     import numpy as np
     from matplotlib.path import Path as Outline
 

@@ -86,6 +86,7 @@ def survey_pdf(sheet: SurveySheet) -> bytes:
 
 
 def _at(x_mm: float, y_mm: float) -> tuple[float, float]:
+    """Position on the page as fractions of its width and height, from mm."""
     return x_mm / _PAGE[0], y_mm / _PAGE[1]
 
 
@@ -143,7 +144,7 @@ def _draw_scale_bar(figure: Any, scale: float) -> None:
 
 
 def _draw_column(figure: Any, paragraphs: Mapping[str, Sequence[str]], x_mm: float) -> None:
-    """Paragraphs below their headings, down to the signatures; what does not fit is counted."""
+    """Draw paragraphs below their headings in a column at `x_mm`; the last line counts those that do not fit."""
     y = _MAP_LOW_MM - 14
     for heading, texts in paragraphs.items():
         figure.text(*_at(x_mm, y), heading, weight="bold", va="center")
@@ -224,6 +225,7 @@ def _text(figure: Any, x: float, y: float, text: str, **style: Any) -> Any:
 
 
 def _shape(figure: Any, kind: str, *given: Any, **style: Any) -> None:
+    """Add a patch of matplotlib to the figure, in pixels; kind : its class."""
     from matplotlib import patches
 
     figure.add_artist(getattr(patches, kind)(*given, transform=None, **style))
@@ -273,6 +275,7 @@ def _legend_rows(figure: Any, names: list[Any], width: int, letter: float) -> li
 
 
 def _draw_legend(figure: Any, row: list[Any], y: float, letter: float) -> None:
+    """Draw one row of the legend at height `y`; letter : size of a letter, pixels."""
     for name, colour, kind, x in row:
         tall = letter if kind == "s" else 0.35 * letter
         _shape(figure, "Rectangle", (x, y + (letter - tall) / 2), letter, tall, facecolor=colour, edgecolor="none")

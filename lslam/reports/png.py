@@ -128,6 +128,7 @@ def grey_png(image: NDArray[np.uint8]) -> bytes:
 
 
 def _png(chunks: list[tuple[bytes, bytes]]) -> bytes:
+    """PNG file of its chunks (type, data)."""
     body = b"".join(
         struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks
     )
@@ -243,6 +244,7 @@ def _window_sums(counts: Longs, window: int, step: int) -> Longs:
 
 
 def _crop_image(cloud: NDArray[Any], crop: Crop) -> NDArray[np.float32]:
+    """Points of a cloud per pixel of a square, row 0 at the largest y."""
     x0, x1, y0, y1 = crop.extent
     counts, _, _ = np.histogram2d(cloud[:, 1], cloud[:, 0], bins=PIXELS, range=((y0, y1), (x0, x1)))
     image: NDArray[np.float32] = counts[::-1].astype(np.float32)

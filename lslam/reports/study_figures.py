@@ -85,6 +85,7 @@ def _tick(plot: Any, x: float) -> str:
 
 
 def _number(value: float) -> str:
+    """Number with three significant digits."""
     return f"{value:.3g}"
 
 
@@ -154,6 +155,7 @@ def study_figures(result: StudyResult) -> Iterator[StudyFigure]:
 
 
 def _errors(figure: Any, result: StudyResult, curves: Sequence[CurveResult]) -> bool:
+    """Draw translation and rotation errors over the parameter. Returns False without any."""
     left, right = figure.subplots(1, 2)
     _quantity(left, result, curves, "translation", "rmse of translation, m", lambda row: row.error)
     _quantity(right, result, curves, "angular", "rmse of rotation, deg", lambda row: row.angular_rmse_deg)
@@ -168,6 +170,7 @@ def _zoom(figure: Any, result: StudyResult, curves: Sequence[CurveResult]) -> bo
 
 
 def _times(figure: Any, result: StudyResult, curves: Sequence[CurveResult]) -> bool:
+    """Draw time per scan and total time over the parameter. Returns False without any."""
     left, right = figure.subplots(1, 2)
     _quantity(left, result, curves, "time_per_scan", "registration per scan, ms", registration_ms)
     _quantity(right, result, curves, "total_time", "total time, s", lambda row: row.total_time_s)
@@ -196,7 +199,10 @@ def _stages(figure: Any, result: StudyResult, curves: Sequence[CurveResult]) -> 
 
 
 def _efficiency(figure: Any, result: StudyResult, curves: Sequence[CurveResult]) -> bool:
-    """Efficiency of each curve relative to its largest value; a bar below where it is within a tenth of that."""
+    """Draw the efficiency of each curve relative to its largest value, with a bar where it is within a tenth of that.
+
+    Returns False without any.
+    """
     names = ("efficiency", "total_efficiency")
     for plot, name in zip(figure.subplots(1, 2), names, strict=True):
         for k, (r, look) in enumerate(_with_looks(result, curves)):
@@ -221,7 +227,10 @@ def _quantity(
     words: str,
     of_row: Callable[[StudyRow], float],
 ) -> None:
-    """Means with their intervals; crosses at the top where a curve is lost; reference runs as dotted lines."""
+    """Plot means with their intervals; crosses at the top where a curve is lost; reference runs as dotted lines.
+
+    name : of the quantity in the curves; words : label of the ordinate; of_row : its value in a reference run
+    """
     tops = []
     rows_of_crosses = 0
     for r, look in _with_looks(result, curves):

@@ -95,6 +95,7 @@ def study_recipes(result: StudyResult) -> list[str]:
 
 
 def _verdicts(result: StudyResult) -> CompareTable:
+    """Table of the verdicts on expected findings."""
     rows = tuple((v.outcome, v.text, v.numbers, v.source or UNKNOWN) for v in result.verdicts)
     return CompareTable("findings", ("verdict", "finding", "here", "source"), rows, 4)
 
@@ -129,6 +130,7 @@ def _laws(result: StudyResult) -> CompareTable:
 
 
 def _law_row(name: str, law: Law) -> tuple[str, ...]:
+    """Cells of a law: formula, coefficients, R2, largest residual, number of points."""
     pairs = zip(law.coefficients, law.margins, strict=True)
     coefficients = ", ".join(f"{value:.4g} ± {margin:.2g}" for value, margin in pairs)
     worst = f"{100 * np.abs(law.residuals).max():.1f} %"
@@ -163,6 +165,7 @@ def _means(result: StudyResult) -> CompareTable:
 
 
 def _beside(result: StudyResult) -> CompareTable:
+    """Table of the reference runs beside the study."""
     rows = tuple((row.series, str(row.seed), *_numbers(row)) for row in result.beside)
     header = ("method", "seed", "translation, m", "rotation, deg", "per scan, ms", "total, s")
     return CompareTable("beside, at its own values", header, rows, 1)
@@ -185,6 +188,7 @@ def _failures(result: StudyResult) -> CompareTable:
 
 
 def _numbers(row: StudyRow) -> Iterable[str]:
+    """Errors and times of a run as texts."""
     yield metres(row.error) if math.isfinite(row.error) else UNKNOWN
     for value, decimals in ((row.angular_rmse_deg, 3), (row.time_per_scan_ms, 1), (row.total_time_s, 2)):
         yield with_decimals(value, decimals) if math.isfinite(value) else UNKNOWN
@@ -205,6 +209,7 @@ def _mean(means: Interval, v: int, name: str) -> str:
 
 
 def _range(result: CurveResult) -> str:
+    """Range of nearly best values of a curve, as text."""
     assert result.optimum is not None
     low, high = (result.curve.name_of(value) for value in (result.optimum.low, result.optimum.high))
     return low if low == high else f"{low} to {high}"
@@ -358,6 +363,7 @@ def timing_notes(rows: Sequence[StudyRow]) -> list[str]:
 
 
 def _section_text(section: StudySection, style: str, heading: str, item: str) -> list[str]:
+    """Title, tables and recipes of a section in the format `style`; heading, item : their patterns."""
     result = section.result
     title = heading.format(f"{result.study}: {' and '.join(result.parameters)} on {result.sequence}")
     recipes = "\n".join(item.format(line) for line in section.recipes)
@@ -377,5 +383,6 @@ def _file_words(result: StudyResult, keys: Set[str]) -> list[str]:
 
 
 def _write_bytes(path: Path, content: bytes) -> None:
+    """Write a file atomically."""
     with atomic_write(path) as stream:
         stream.write(content)

@@ -110,7 +110,7 @@ class Frame:
                 self.add(f'<path class="line {style}" d="{path(px[run], py[run])}"/>')
 
     def band(self, band: Band) -> None:
-        """An area, broken where one of its limits is not finite."""
+        """Add an area between two series, broken where one of its limits is not finite."""
         x, low, high = (
             np.asarray(v, np.float64)[:: max(len(band.x) // BINS, 1)] for v in (band.x, band.low, band.high)
         )
@@ -120,11 +120,11 @@ class Frame:
             self.add(f'<path class="band {band.style}" d="{around}Z"/>')
 
     def dot(self, px: float, py: float, style: str, radius: float = 4) -> None:
-        """A filled circle at SVG coordinates."""
+        """Add a filled circle at SVG coordinates."""
         self.add(f'<circle class="dot {style}" cx="{px:.1f}" cy="{py:.1f}" r="{radius:g}"/>')
 
     def marks(self, x: NDArray[Any], style: str) -> None:
-        """Vertical lines over the whole height."""
+        """Add vertical lines over the whole height at the abscissas `x`."""
         places = sorted({round(float(v)) for v in self.px(x)})
         if places:
             self.add(f'<path class="{style}" d="{"".join(f"M{p} {self.top}V{self.bottom}" for p in places)}"/>')
@@ -143,6 +143,7 @@ class Frame:
 
 
 def _text(x: float, y: float, text: str, anchor: str, style: str) -> str:
+    """SVG text element."""
     return f'<text class="{style}" x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{escape(text)}</text>'
 
 
@@ -227,8 +228,9 @@ def line_chart(
     bands: Sequence[Band] = (),
     by: By = "",
 ) -> str:
-    """Lines over a common abscissa; `marks` are abscissas of failed scans. Empty text when no value is finite.
+    """SVG of lines over a common abscissa; empty text when no value is finite.
 
+    marks : abscissas of failed scans
     bands : areas behind the lines; where one is wider than the lines need, as at the start of a filter, it is cut off
     zero : whether the ordinate includes 0; whole_x : ticks of the abscissa at whole numbers only
     by : what of a scan the abscissa is
@@ -286,11 +288,11 @@ def plane_chart(
     tallest: int = 460,
     by: By = "",
 ) -> str:
-    """Tracks from above, x to the right, y up; `backdrop` is an image's address and its extent (x0, x1, y0, y1),
-    in the style `backdrop_style`.
+    """SVG of tracks from above, x to the right, y up; empty text when nothing is finite.
 
-    `points` (K, 2) are marked as failures; `dots` are points (K, 2) in a style each, one group over
-    the other; `by` says whose world it is; `width` and `tallest` as for `_fit_frame`. Empty text when nothing is finite.
+    backdrop : an image's address and its extent (x0, x1, y0, y1), m, in the style `backdrop_style`
+    points : (K, 2) marked as failures; dots : points (K, 2) in a style each, one group over the other
+    by : whose world it is; width, tallest : as for `_fit_frame`
     """
     xs, ys = [t.xy[:, 0] for t in tracks], [t.xy[:, 1] for t in tracks]
     if backdrop is not None:

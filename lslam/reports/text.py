@@ -160,10 +160,12 @@ def _saving_text(imu: dict[str, Any]) -> str:
 
 
 def _failure(failure: ScanResult) -> str:
+    """Text about a scan that was not registered."""
     return f"scan {failure.index} {failure.status}: {failure.reason or 'reason not given'}"
 
 
 def _score_rows(record: RunRecord, evaluation: Evaluation | None) -> list[tuple[str, str]]:
+    """Rows with the errors against ground truth, or with the reason why there are none."""
     if evaluation is None:
         why = "ground truth could not be compared" if record.ground_truth is not None else "no ground truth is known"
         return [("errors", f"not stated: {why}")]
@@ -244,6 +246,7 @@ def text_table(grid: Grid, names: int = 1) -> str:
 
 
 def _escape(cell: str) -> str:
+    """Text of a cell with LaTeX's special characters escaped."""
     signs = {sign: f"\\{sign}" for sign in "&%$#_{}"} | {"\\": "\\textbackslash{}"}
     cell = cell.translate({ord(sign): word for sign, word in signs.items()})
     return cell.strip().replace("±", "$\\pm$")

@@ -132,6 +132,7 @@ def populate(scenario: Scenario, city: City, path: PosePath, seeds: tuple[int, .
 
 
 def _terrain(scenario: Scenario, rng: np.random.Generator) -> Terrain:
+    """Random ground of the scenario's relief."""
     world = scenario.world
     return rolling(rng, world.relief, world.unevenness, world.swell, world.slope)
 
@@ -268,6 +269,7 @@ def _check_start(scene: RayScene, T: Floats) -> None:
 
 
 def _fail(what: str, T: Floats, index: int) -> None:
+    """Raise UsageError that the path does `what` at its pose number `index`."""
     along = float(np.linalg.norm(np.diff(T[: index + 1, :3, 3], axis=0), axis=1).sum())
     x, y, z = T[index, :3, 3]
     raise UsageError(

@@ -52,6 +52,7 @@ class Layout(Section):
 
     @model_validator(mode="after")
     def _check_ranges(self) -> Layout:
+        """Raise ValueError for a range in the wrong order or too small."""
         for name, least in (("house_width", 3), ("house_depth", 3), ("gap", 0), ("setback", 0), ("storeys", 1)):
             low, high = getattr(self, name)
             if not least <= low <= high:
@@ -92,11 +93,11 @@ class StreetSite:
 
     @classmethod
     def begin(cls, street: RouteCurve, terrain: Terrain, layout: Layout, rng: np.random.Generator) -> StreetSite:
-        """A place without anything."""
+        """An empty place along a street."""
         return cls(MeshBuilder(), street, terrain, layout, rng)
 
     def along(self, street: RouteCurve) -> StreetSite:
-        """The same place along another street."""
+        """The same place, seen along another street: distances and offsets refer to that one."""
         return replace(self, street=street)
 
     def beside(self, s: float, offset: float) -> Floats:

@@ -45,6 +45,7 @@ Houses = list[tuple[Floats, float]]  # outline (4, 2) and height of each, m
 
 
 def _city(site: StreetSite, houses: Houses) -> City:
+    """The city of what stands on the site; houses : outlines and heights."""
     outlines, heights = [outline for outline, _ in houses], [height for _, height in houses]
     return City(site.builder.build(), site.terrain, site.street, outlines, heights, [site.street])
 

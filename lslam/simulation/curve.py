@@ -92,6 +92,7 @@ class RouteCurve:
         return np.linspace(0, self.length, count + 1)[: -1 if self.closed else None]
 
     def _wrap(self, s: NDArray[Any]) -> Floats:
+        """Distances, m, within one lap of a closed curve; unchanged on an open one."""
         s = np.asarray(s, np.float64)
         return np.asarray(np.mod(s, self.length) if self.closed else s)
 
@@ -187,7 +188,7 @@ class Terrain:
         return np.stack([portable.dot(steepness, self.waves[:, k]) + self.tilt[k] for k in (0, 1)], axis=-1)
 
     def _phases_at(self, xy: NDArray[Any]) -> Floats:
-        """(..., K) of the waves, rad."""
+        """Phases (..., K), rad, of the waves at positions (..., 2), m."""
         xy = np.asarray(xy, np.float64)
         return np.asarray(xy[..., :1] * self.waves[:, 0] + xy[..., 1:] * self.waves[:, 1] + self.phases)
 

@@ -100,6 +100,7 @@ class Motion:
         )
 
     def _inside(self, times: NDArray[Any]) -> Floats:
+        """The times as float64; raises ValueError for one outside 0..duration."""
         at = np.asarray(times, np.float64)
         if len(at) and not (at.min() >= -_EDGE and at.max() <= self.duration + _EDGE):
             raise ValueError(f"times {at.min():g}..{at.max():g} s leave the motion of 0..{self.duration:g} s")
@@ -171,6 +172,7 @@ class Vibration(Section):
 
     @model_validator(mode="after")
     def _check_band(self) -> Vibration:
+        """Raise ValueError for an invalid range of frequencies."""
         low, high = self.band_hz
         if not 0 < low <= high <= 500:
             raise ValueError(f"vibration.band_hz = [{low:g}, {high:g}], expected two numbers up to 500, in order")

@@ -285,6 +285,7 @@ def _directions(
 
 
 def _unit(azimuth: NDArray[np.float32], elevation: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Unit vectors (N, 3) by azimuth and elevation, rad."""
     (sine, cosine), (rise, flat) = portable.sine_cosine(azimuth), portable.sine_cosine(elevation)
     both = np.stack([flat * cosine, flat * sine, rise], axis=-1)
     return np.asarray(both.reshape(-1, 3))
@@ -314,7 +315,7 @@ def _into_city(
 
 
 def _on(steps: Floats) -> NDArray[np.float32]:
-    """Steps from one pose to the next, one per pose: the last step is repeated. Float32."""
+    """Steps from each pose to the next, float32; the last step is repeated, so that there is one per pose."""
     return np.concatenate([steps, steps[-1:]]).astype(np.float32)
 
 

@@ -149,6 +149,7 @@ _KITTI_HEIGHTS = (0.21,) * 10 + (0.20,) * 22 + (0.12,) * 32
 
 
 def _even(top_deg: float, bottom_deg: float, count: int) -> tuple[float, ...]:
+    """Elevations, deg, of `count` evenly spaced rings."""
     return tuple(float(e) for e in np.linspace(top_deg, bottom_deg, count))
 
 

@@ -205,6 +205,7 @@ def _body(
 
 
 def _keeps_clear(body: Mover, times: Floats, ego: Floats) -> bool:
+    """Whether a body stays at least `NEAREST_M` away from the LiDAR's poses `ego` (M, 4, 4) at the times."""
     at = body.poses(times)[:, :3, 3]
     apart = portable.hypot(*(at - ego[:, :3, 3])[:, :2].T)
     # What flies high above is in nobody's way.

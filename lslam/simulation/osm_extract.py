@@ -143,6 +143,7 @@ def read_perturbation(path: Path) -> Perturbation:
 
 
 def _pair(values: Any) -> tuple[float, float]:
+    """Two values as floats."""
     x, y = values
     return float(x), float(y)
 
@@ -213,6 +214,7 @@ def _some(rng: np.random.Generator, count: int, share: float) -> list[int]:
 
 
 def _pick(rng: np.random.Generator, candidates: list[int], number: int) -> list[int]:
+    """At most `number` random ones of the candidates, in order."""
     chosen = rng.permutation(len(candidates))[: max(number, 0)]
     return [candidates[k] for k in np.sort(chosen)]
 
@@ -251,6 +253,7 @@ def _radius(building: Building) -> float:
 
 
 def _corners(building: Building) -> int:
+    """Number of corners of a building's outlines."""
     return sum(len(ring) for footprint in building.footprints for ring in footprint.rings)
 
 

@@ -311,12 +311,13 @@ def side_roads(
 
 
 def _is_open_ground(tags: Mapping[str, str]) -> bool:
+    """Whether a way is on open ground: no tunnel, bridge, area, and neither covered nor indoors."""
     covered = any(tags.get(key, "no") != "no" for key in ("tunnel", "bridge", "covered", "indoor"))
     return not covered and not is_underground(tags) and tags.get("area") != "yes"
 
 
 def _known_runs(nodes: Sequence[int], data: OsmData) -> list[tuple[int, ...]]:
-    """Stretches of a way whose nodes are all in the extract."""
+    """Stretches of a way, as node numbers, whose nodes are all in the extract."""
     runs: list[list[int]] = [[]]
     for node in nodes:
         if node not in data.nodes:
@@ -375,4 +376,5 @@ def _longest_way(
 
 
 def _length(line: Floats) -> float:
+    """Length of a polyline (N, 2), m."""
     return float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum())

@@ -57,6 +57,7 @@ def plan_of(scene: RayScene, city: City, line: Floats) -> ScenePlan:
 
 
 def _extent(city: City, line: Floats) -> tuple[Floats, Floats]:
+    """Corners (2,), m, of a plan that shows all buildings and the path."""
     places = np.concatenate([line[:, :2], *city.footprints])
     return np.floor(places.min(axis=0) - BORDER), np.ceil(places.max(axis=0) + BORDER)
 

@@ -295,11 +295,12 @@ def _check_space(out: Path, part: Path, drive: SimulatedDrive) -> None:
 
 
 def _size(amount: float) -> str:
+    """Size in bytes as text."""
     return f"{amount / 1e9:.1f} GB" if amount >= 1e9 else f"{amount / 1e6:.1f} MB"
 
 
 def _keep_what_is_worth_it(out: Path, part: Path) -> None:
-    """Keep complete scans for --resume. If there are none, remove the folder, so that the command can be repeated."""
+    """After an interruption, keep the folder of scans for --resume; remove it if no scan is complete."""
     with contextlib.suppress(OSError):
         kept = sum(1 for _ in (part / PER_POINT).glob("*.npz"))
         if kept and read_mark(part) is not None:

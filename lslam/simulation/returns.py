@@ -48,7 +48,7 @@ class Rays:
         return Rays(self.origins[which], self.directions[which], self.times[which])
 
     def with_more(self, others: Rays) -> Rays:
-        """These rays, followed by `others`."""
+        """The rays followed by `others`, in one object."""
         return Rays(
             np.concatenate([self.origins, others.origins]),
             np.concatenate([self.directions, others.directions]),
@@ -130,6 +130,7 @@ def _leaf(hits: Hits, which: NDArray[np.intp], at: NDArray[np.float32], facing: 
 def _solid(
     mesh: SceneMesh, rays: Rays, hits: Hits, which: NDArray[np.intp], at: NDArray[np.float32], face: Ints
 ) -> None:
+    """Set hits of the rays `which` on faces of a mesh, at the distances `at`, m."""
     hits.distance[which] = at
     hits.cosine[which] = np.abs(np.einsum("ij,ij->i", mesh.normals[face], rays.directions[which]))
     hits.surface[which] = mesh.surfaces[face]
@@ -232,6 +233,7 @@ def texture(places: Array) -> Array:
 
 @cache
 def _bumps() -> Array:
+    """Table of standard normal numbers for surface heights."""
     return np.random.default_rng(_TABLE).standard_normal(_TABLE, np.float32)
 
 
@@ -277,6 +279,7 @@ def reflect(rays: Rays, distance: Array, normals: Array) -> Rays:
 
 
 def _gain(returns: Returns, hits: Hits, distance: Array) -> Array:
+    """(N,) factor on the light of echoes: attenuation in the air, and shiny surfaces met at an angle."""
     gain = portable.exp(np.float32(-2 * returns.attenuation) * distance)
     if returns.paint > 0:
         shiny = np.flatnonzero((hits.surface == Surface.CAR) | is_glass(hits.surface))

@@ -212,6 +212,7 @@ def read_way_points(path: Path, origin: NDArray[Any] | None = None) -> WayPoints
 
 
 def _text(path: Path) -> str:
+    """Text of a file. Raises InputError."""
     with input_errors(path, UnicodeDecodeError):
         return path.read_text(encoding="utf-8-sig")
 
@@ -233,6 +234,7 @@ def _from_toml(path: Path) -> WayPoints:
 
 
 def _rows(path: Path) -> list[list[str]]:
+    """Rows of cells of a CSV file, without comments. Raises InputError."""
     lines = (line for line in _text(path).splitlines() if line.strip() and not line.lstrip().startswith("#"))
     try:
         return [[cell.strip() for cell in row] for row in csv.reader(lines)]
@@ -257,6 +259,7 @@ def _from_csv(path: Path) -> WayPoints:
 
 
 def _is_number(text: str) -> bool:
+    """Whether a text is a number."""
     try:
         float(text)
     except ValueError:

@@ -119,6 +119,7 @@ def out_and_back(length: float, radius: float) -> Floats:
 
 
 def _straight(length: float) -> Shape:
+    """Shape of a straight line of `length` m along +x."""
     return lambda _: np.array([[0.0, 0.0], [length, 0.0]])
 
 
@@ -184,6 +185,7 @@ class WorldSection(Section):
 
     @model_validator(mode="after")
     def _check_slope(self) -> WorldSection:
+        """Raise ValueError for an invalid range of slopes."""
         low, high = self.slope
         if not 0 <= low <= high <= 0.2:
             raise ValueError(f"world.slope = [{low:g}, {high:g}], expected two numbers from 0 to 0.2, in order")
@@ -287,6 +289,7 @@ def scenario_text(scenario: Scenario) -> str:
 
 
 def _ready(name: str) -> dict[str, Any]:
+    """Tree of a scenario that ships with the package. Raises UsageError with the nearest name."""
     if name not in scenario_names():
         raise UsageError(f"no scenario {name!r} and no file NAME.toml; {nearest(name, scenario_names())}")
     return parse_toml(read_package_files("lslam.simulation", "ready")[name])

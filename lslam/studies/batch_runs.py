@@ -60,6 +60,7 @@ def refused_line(words: str, path: Path, config: Config, folder: Path | None, re
 
 
 def _reading_digest(reading: Mapping[str, Any]) -> str:
+    """Digest of the options that a recording is opened with."""
     return hashlib.sha256(repr(sorted(reading.items())).encode()).hexdigest()
 
 

@@ -68,7 +68,7 @@ def connect(scheduler: str | None, local: str | None, title: str, *, is_persiste
 
 
 def _client(scheduler: str) -> Any:
-    """Raises InputError when the scheduler does not answer."""
+    """Dask client of the scheduler. Raises InputError when the scheduler does not answer."""
     import dask
     from distributed import Client
 
@@ -182,6 +182,7 @@ class Cluster:
             time.sleep(_PAUSE_S)
 
     def _workers(self) -> dict[str, Any]:
+        """Workers of the scheduler by address."""
         return dict(self.client.scheduler_info(n_workers=-1)["workers"])
 
 
@@ -253,6 +254,7 @@ def _paths_to_check(paths: Iterable[Path]) -> list[str]:
 
 
 def _count(local: str) -> int:
+    """Number of workers in "local:N". Raises UsageError for another text."""
     number = local.removeprefix(_LOCAL)
     if not local.startswith(_LOCAL) or not whole_number(number):
         raise UsageError(f"--cluster {local}: local:N with N workers, for example local:2")

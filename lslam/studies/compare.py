@@ -169,6 +169,7 @@ def _turn_about_path(error: AbsoluteError, gt_positions: Floats) -> float:
 
 
 def _available(errors: list[AbsoluteError]) -> AbsoluteError:
+    """Errors by the first alignment that is determined, else by the last."""
     return next((error for error in errors if error.available), errors[-1])
 
 
@@ -193,6 +194,7 @@ def _apart(run: UsableRun, other: UsableRun) -> tuple[Floats | None, Floats | No
 
 
 def _map_file(run: UsableRun) -> Path | None:
+    """Map file of a run; None without one that can be drawn."""
     return next((path for path in sorted(run.job.folder.glob("map.*")) if path.suffix in (".ply", ".pcd")), None)
 
 
@@ -244,7 +246,7 @@ def run_comparison(plan: Plan, progress: StudyProgress | None = None) -> Compari
 
 
 def _cells(plan: Plan, progress: StudyProgress) -> list[Cell]:
-    """Recordings as they are, scenarios simulated once per seed."""
+    """Cells of the comparison: recordings as they are, scenarios simulated once per seed."""
     needs_imu = any(variant.config.imu.use for variant in plan.variants)
     # What cannot be opened, or has no IMU though one is asked for, is said before anything is simulated.
     root = plan.output.data_root
@@ -273,7 +275,7 @@ def _scene(plan: Plan, subject: Subject) -> Scene:
 
 
 def _notes(scores: Sequence[RunScore]) -> list[str]:
-    """What the reader of the times must know."""
+    """Sentences on what limits the comparison of times, for readers of the tables."""
     notes = []
     if any(score.jobs > 1 for score in scores if score.is_usable):
         notes.append("times marked ~ are not comparable: several runs shared the machine (--jobs)")
@@ -290,7 +292,7 @@ def _notes(scores: Sequence[RunScore]) -> list[str]:
 
 
 def _weigh(plan: Plan, jobs: Sequence[Job], scores: Sequence[RunScore]) -> tuple[Comparison, list[Drawing]]:
-    """Comparison of the scores of `jobs`, and drawings of their trajectories."""
+    """Compare the scores of `jobs`: tables, pairs and differences; and drawings of their trajectories."""
     drawings, differences = draw(jobs, scores)
     methods = tuple(variant.name for variant in plan.variants)
     return Comparison(
@@ -325,6 +327,7 @@ class CompareOutcome:
         return self.table()
 
     def _repr_html_(self) -> str:
+        """Table for notebooks."""
         return as_html(self.table())
 
 

@@ -131,6 +131,7 @@ def estimate(
 
 
 def _group(members: list[Job], recording: _PilotRecording, variants: dict[str, Variant]) -> _Group:
+    """Group of runs with its pilots."""
     names = list(dict.fromkeys(job.method for job in members))
     first = {job.method: job for job in members}
     X = _coordinates([variants[name] for name in names])

@@ -265,6 +265,7 @@ class ReadyComparison(Section):
         return [(p.of, p.values[system], p.source) for p in self.numbers if p.sequence == plain and system in p.values]
 
     def _number(self, sequence: str, method: str, of: str) -> float | None:
+        """Number printed for the quantity `of` of a method on a drive; None where none is printed."""
         return next((value for kind, value, _ in self._of(sequence, method) if kind == of), None)
 
     def _statements(self, runs: Sequence[RunScore]) -> Table:
@@ -318,6 +319,7 @@ def _values(runs: Sequence[RunScore], sequence: str, method: str, of: Quantity) 
 
 
 def _median_and_worst(values: Sequence[float]) -> str:
+    """Median and worst value as text."""
     return " / ".join("failed" if value == inf else significant(value) for value in median_and_worst(values))
 
 

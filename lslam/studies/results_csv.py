@@ -153,10 +153,12 @@ def _row(cells: dict[str, str]) -> StudyRow:
 
 
 def _none_if_nan(value: Value) -> Value | None:
+    """The value, None for NaN."""
     return None if isinstance(value, float) and math.isnan(value) else value
 
 
 def _text(value: Value | None) -> str:
+    """Value as a cell; empty for None."""
     if isinstance(value, bool):
         return str(value).lower()
     return "" if value is None else str(value)
@@ -170,6 +172,7 @@ def _truth(text: str) -> bool:
 
 
 def _number(text: str) -> float:
+    """Number in a cell; NaN for an empty one."""
     return float(text) if text else math.nan
 
 

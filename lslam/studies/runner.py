@@ -59,6 +59,8 @@ class WorkerPool:
 
 @dataclass
 class _Worker:
+    """A worker process with its task."""
+
     process: BaseProcess
     pipe: Connection
     index: int = -1
@@ -212,6 +214,7 @@ def _cause(exit_code: int | None, output: Path) -> str:
 
 
 def _last_words(output: Path) -> str:
+    """Last line of a process's output, after a colon; empty without output."""
     try:
         lines = [line.strip() for line in output.read_text(errors="replace").splitlines() if line.strip()]
     except OSError:

@@ -120,8 +120,9 @@ def _meaning(name: str) -> tuple[str, str]:
 
 
 def study_variants(study: StudyConfig, settings: Sequence[str] = ()) -> list[Variant]:
-    """All of a study; `settings` ("a.b=v") beat what the study says, but not its parameters.
+    """All variants of a study, one per method and point of its parameters.
 
+    settings : "a.b=v", which override the study's settings, but not its parameters
     Raises ConfigError or UsageError naming the parameter, the value and the nearest known key; UsageError for unknown methods.
     """
     common = [*_ALWAYS, *settings_of(study.config), *settings]
@@ -159,7 +160,7 @@ def _check_metric(study: StudyConfig, align: Sequence[str]) -> None:
 
 
 def free_name(name: str, names: set[str]) -> str:
-    """The name as a folder's, with a number when one in `names` has it; it is names then.
+    """The name as a folder name that is not in `names`, with a number appended if necessary; it is added to `names`.
 
     >>> names = {"icp"}
     >>> free_name("icp", names), free_name("icp", names)
@@ -179,5 +180,5 @@ def settings_of(sections: dict[str, dict[str, Any]]) -> list[str]:
 
 
 def _setting(values: dict[str, Any]) -> list[str]:
-    """As `--set` takes them: JSON's values are TOML's."""
+    """Values of a section as "key=value", as `--set` takes them."""
     return [f"{key}={json.dumps(value)}" for key, value in values.items()]

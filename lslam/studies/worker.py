@@ -64,7 +64,7 @@ class ScanStore:
 
 
 def size_of(scan: Scan) -> int:
-    """Bytes of its arrays."""
+    """Bytes of the arrays of a scan."""
     values = (getattr(scan, f.name) for f in fields(scan))
     return sum(value.nbytes for value in values if isinstance(value, np.ndarray))
 
@@ -121,9 +121,9 @@ class WorkerContext:
 
 
 def execute(job: Job, context: WorkerContext) -> None:
-    """Run the job into its folder, replacing what is there unless it goes on with that, and leave its state behind.
+    """Run the job into its folder, replacing what is there unless the run is resumed, and write its state.
 
-    Raises nothing of the run's; KeyboardInterrupt after the state is written, so that the process ends.
+    Errors of the run become its state. Raises KeyboardInterrupt after the state is written, so that the process ends.
     """
     # What the run says is in its log.txt; the screen belongs to the study.
     log = logging.getLogger("lslam")
@@ -171,7 +171,7 @@ def execute(job: Job, context: WorkerContext) -> None:
 
 
 def _keep_traceback(folder: Path, error: Exception) -> str:
-    """Put it behind what the run said, in its log.txt; the end of a sentence that says so, empty when it cannot be."""
+    """Append the traceback of an error to the run's log.txt. Returns the end of a sentence that says so; empty if it fails."""
     folder = spool_of(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -183,7 +183,7 @@ def _keep_traceback(folder: Path, error: Exception) -> str:
 
 
 def _drop_lone_log(folder: Path) -> None:
-    """A mistake before there was a run left its traceback in a folder that is none, and so would not be replaced."""
+    """Remove a folder that holds only the log of an error, since it is no run folder and could not be replaced."""
     folder = spool_of(folder)
     with contextlib.suppress(OSError):  # what is in the way is said when the run is made
         if not (folder / MANIFEST).exists():
@@ -257,4 +257,5 @@ def _open(job: Job) -> Sequence:
 
 @cache
 def _sequences() -> SequenceCache:
+    """The cache of opened sequences of this process."""
     return SequenceCache(ScanStore(cache_limit()))

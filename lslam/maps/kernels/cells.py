@@ -246,6 +246,7 @@ def _seen_row(key: int, slots: Ints, rows: NDArray[np.int64], row_count: int) ->
 
 @inline
 def _update(rows: NDArray[np.int64], row: int, change: int, low: int, high: int) -> None:
+    """Add the log-odds `change` to a row: to its sum, and to both clamped values."""
     rows[row, 1] += change
     rows[row, 2] = min(max(rows[row, 2] + change, low), high)
     rows[row, 3] = min(max(rows[row, 3] + change, low), high)

@@ -75,7 +75,7 @@ def shifted_means(image: NDArray[np.float32], pixels: Floats, weights: Floats, m
 
 @inline
 def _share(point: int, view: int) -> float:
-    """Number in (0, 1], evenly spread, which a point and a view always share."""
+    """Pseudorandom number in (0, 1], the same for a point and a view in every run."""
     h = (point * 1000003 + view + 1) * -7046029254386353131
     h = (h ^ ((h >> 30) & 0x3FFFFFFFF)) * _MIX_A
     h = (h ^ ((h >> 27) & 0x1FFFFFFFFF)) * _MIX_B
@@ -85,7 +85,7 @@ def _share(point: int, view: int) -> float:
 
 @inline
 def _seen_from(points: NDArray[np.float32], i: int, T: Floats, lens: Floats) -> tuple[float, float, float]:
-    """Pixel and range, m, of point i; NaN where the lens does not see it."""
+    """Pixel and range, m, of point i for a camera at T (4, 4); NaN where the lens does not see it."""
     px, py, pz = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
     x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
     y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
@@ -125,7 +125,10 @@ def _is_gone(
     far: float,
     behind: NDArray[np.float32],
 ) -> bool:
-    """Whether something is seen through point i, at pixel u, v and range `far`, in the ranges `behind`: it is not there."""
+    """Whether a scan measured something behind point i: `behind` has a longer range than `far`, m, at pixel u, v.
+
+    The map's point is of something that has moved away.
+    """
     height, width = behind.shape
     if not (u > -0.5 and v > -0.5 and u < width - 0.5 and v < height - 0.5):
         return False

@@ -254,21 +254,26 @@ class BagMessages:
         return kind(stamp=stamp, frame_id=frame, **counted)
 
     def _pose(self, T: Floats) -> Any:
+        """Pose message of T (4, 4)."""
         types = self._types
         return types["geometry_msgs/msg/Pose"](
             position=types["geometry_msgs/msg/Point"](**self._xyz(T[:3, 3])), orientation=self._rotation(T)
         )
 
     def _vector(self, v: Floats) -> Any:
+        """Vector3 message of v (3,)."""
         return self._types["geometry_msgs/msg/Vector3"](**self._xyz(v))
 
     @staticmethod
     def _xyz(v: Floats) -> dict[str, float]:
+        """Coordinates (3,) by the names x, y, z."""
         return dict(zip("xyz", (float(c) for c in v), strict=True))
 
     def _rotation(self, T: Floats) -> Any:
+        """Quaternion message of the rotation in T (4, 4)."""
         return self._quaternion(so3.to_quaternion(T[:3, :3]).tolist())
 
     def _quaternion(self, q: list[float]) -> Any:
+        """Quaternion message of x, y, z, w."""
         x, y, z, w = (float(v) for v in q)
         return self._types["geometry_msgs/msg/Quaternion"](x=x, y=y, z=z, w=w)

@@ -90,11 +90,13 @@ def convert_run(
 
 
 def _write_pose(writer: BagWriter, stamp: int, T: Floats, covariance: Floats | None) -> None:
+    """Write the pose of a scan as transform and as Odometry."""
     writer.write("/tf", stamp, writer.messages.transforms(stamp, {(WORLD, BODY): T}))
     writer.write(POSE_TOPIC, stamp, writer.messages.odometry(stamp, T, WORLD, BODY, covariance))
 
 
 def _write_points(writer: BagWriter, stamp: int, scan: PosedScan, voxel: float) -> None:
+    """Write the points of a scan, of each voxel of edge `voxel`, m, the first; 0: all."""
     points, intensity = scan.points, scan.intensity
     if voxel:
         some = first_points(np.ascontiguousarray(points, np.float32), voxel)

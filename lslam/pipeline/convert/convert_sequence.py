@@ -218,11 +218,13 @@ def _messages(source: _Source, messages: BagMessages) -> list[Iterator[Message]]
 
 
 def _clouds(source: _Source, lidar: _Lidar, rank: int, messages: BagMessages) -> Iterator[Message]:
+    """Messages with the scans of a LiDAR; rank : their order among messages of equal stamps."""
     for scan in source.scans(lidar):
         yield scan.stamp_ns, rank, lidar.topic, partial(messages.cloud, scan, lidar.frame)
 
 
 def _first_stamp(source: _Source) -> int:
+    """Earliest stamp of all streams, ns."""
     sequence = source.sequence
     streams = (sequence.imu, sequence.gnss, sequence.ground_truth)
     starts = [int(s.stamps_ns[0]) for s in streams if s is not None and len(s)]

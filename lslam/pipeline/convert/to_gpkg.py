@@ -108,6 +108,7 @@ def _write_layer(package: Any, layer: GeoLayer, system: Any) -> None:
 
 
 def _type_of(values: Sequence[Value]) -> str:
+    """Column type of a GeoPackage for the values."""
     from fudgeo.enumeration import FieldType
 
     known = {int: FieldType.integer, float: FieldType.double, datetime: FieldType.datetime}
@@ -283,4 +284,5 @@ def _project(points: Floats, projection: Projection) -> Floats:
 
 
 def _close_ring(ring: Floats, projection: Projection) -> Floats:
+    """Projected corners (K + 1, 2), m, of a ring, the first repeated at the end."""
     return _project(np.concatenate([ring, ring[:1]]), projection)[:, :2]

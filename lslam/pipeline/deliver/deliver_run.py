@@ -234,6 +234,7 @@ def _sigmas(covariances: Floats) -> Floats:
 
 
 def _pose_time(run: EarlierRun) -> str:
+    """Where in a sweep the poses of the run belong: start, middle or end."""
     return str(run.manifest.get("frames", {}).get("pose_time", "scan_start")).removeprefix("scan_")
 
 

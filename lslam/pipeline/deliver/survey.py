@@ -156,6 +156,7 @@ def read_survey(folder: Path, crs: OutputCrs | None, check: Path | None = None, 
 
 
 def _drives(folder: Path, manifest: Mapping[str, Any]) -> dict[str, EarlierRun]:
+    """The run in a folder by its name, or the sessions of a merge at their merged poses; InputError where one is missing."""
     sessions = sessions_of(folder)
     if sessions is None:
         run = read_run(folder)
@@ -220,7 +221,7 @@ def _points(
     off: Floats,
     projection: Projection,
 ) -> SurveyedPoints:
-    """From places lat, lon (deg), height (m), and residuals (N, 3) east, north, up, m."""
+    """Surveyed points from places (N, 3) lat, lon (deg), height (m), and residuals `off` (N, 3) east, north, up, m."""
     there = projection.georeference
     enu = geodesy.to_local(places, there.origin)
     stated, solved = (projection.apply(se3.apply(se3.inverse(there.T_enu_world), at)) for at in (enu, enu - off))
@@ -266,6 +267,7 @@ def precision_note(survey: Survey) -> str:
 
 
 def _pair(values: Any) -> str:
+    """Horizontal and vertical number, m, as text."""
     return f"{with_decimals(float(values[0]), 3)} m horizontally, {with_decimals(float(values[1]), 3)} m vertically"
 
 
@@ -361,4 +363,5 @@ def readme(survey: Survey, files: Mapping[str, str], notes: Sequence[str], comma
 
 
 def _paragraph(text: str) -> list[str]:
+    """Lines of a text, wrapped."""
     return textwrap.wrap(text, _WIDTH, break_long_words=False, break_on_hyphens=False)

@@ -215,6 +215,7 @@ def _scores(
 
 
 def _times() -> Floats:
+    """Time shifts to try, s."""
     steps = round(_FARTHEST_S / _STEP_S)
     return np.asarray(_STEP_S * np.arange(-steps, steps + 1), np.float64)
 

@@ -223,6 +223,7 @@ def _unit(ratio: float, within: float) -> float:
 
 
 def _factors() -> list[float]:
+    """Ratios of units of time, larger and smaller than 1."""
     return [*UNITS, *(1 / factor for factor in UNITS)]
 
 
@@ -240,10 +241,12 @@ def _suspect(what: str, factor: float, would_be: str) -> tuple[str, str]:
 
 
 def _step(stamps: Stamps) -> float:
+    """Median of the positive steps of stamps, s; 0 without any."""
     steps = np.diff(stamps)
     steps = steps[steps > 0]
     return float(np.median(steps)) * 1e-9 if len(steps) else 0.0
 
 
 def _seconds(stamps: Stamps) -> float:
+    """Time from the first to the last stamp, s."""
     return float(stamps.max() - stamps.min()) * 1e-9

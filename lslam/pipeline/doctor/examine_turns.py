@@ -244,4 +244,5 @@ def _by_axis(lidar_rates: Floats, imu_rates: Floats) -> list[float | None] | Non
 
 
 def _rows(R: Floats) -> str:
+    """Matrix as text, row by row."""
     return "[" + ", ".join("[" + ", ".join(f"{v:.3g}" if abs(v) > 5e-4 else "0" for v in row) + "]" for row in R) + "]"

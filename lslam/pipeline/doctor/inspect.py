@@ -79,11 +79,13 @@ def bag_at(name_or_path: str, data_root: Path | None) -> Facts | None:
 
 
 def _span(bag: Bag, topic: BagTopic) -> tuple[int, int] | None:
+    """Earliest and latest time of recording of a topic, ns; None without messages."""
     stamps = topic.stamps_ns.tolist()
     return (min(stamps), max(stamps)) if stamps else None
 
 
 def _rate(bag: Bag, topic: BagTopic) -> float | None:
+    """Messages per second of a topic; None below two messages."""
     span = _span(bag, topic)
     if span is None or span[0] == span[1]:
         return None
@@ -339,10 +341,12 @@ def _scan_facts(scan: Scan) -> Facts:
 
 
 def _range(values: list[int]) -> Facts | None:
+    """Minimum, median and maximum; None without values."""
     return {"min": min(values), "median": float(np.median(values)), "max": max(values)} if values else None
 
 
 def _ranges(scans: list[Facts]) -> Facts | None:
+    """Quantiles of range, m: of each scan, and of these the median, with the extremes of all."""
     if not scans:
         return None
     table = np.array([s["ranges"] for s in scans])

@@ -70,7 +70,7 @@ class Point(BaseModel):
 
 
 class Edits(BaseModel):
-    """All of it."""
+    """All corrections of a run."""
 
     model_config = ConfigDict(extra="forbid")
     pairs: list[Pair] = Field(max_length=5000)
@@ -140,7 +140,7 @@ class Corrections:
         return {"pairs": len(edits.pairs), "points": len(edits.points)}
 
     def arguments(self) -> list[str]:
-        """Of `lslam graph`, for the files that are there. Raises UsageError without any."""
+        """Command-line arguments for `lslam graph` that name the existing files. Raises UsageError without any."""
         flags = {"--loops": self.folder / EDITS, "--control": self.folder / POINTS}
         words = [word for flag, path in flags.items() if path.is_file() for word in (flag, str(path))]
         if not words:
@@ -174,6 +174,7 @@ class Corrections:
         return {**pair_data(view), "scans": [self._results[k].index for k in scans], **judgement(candidate)}
 
     def _before(self, name: str, other: str) -> Path | None:
+        """File `name` of the run folder, else the file `other`; None if neither exists."""
         path = self.folder / name
         if path.is_file():
             return path
@@ -187,6 +188,7 @@ class Corrections:
         return self._results[int(np.abs(stamps - stamp_of(instant, self._results)).argmin())].index
 
     def _result(self, text: str) -> ScanResult:
+        """Result of the scan with the number in `text`. Raises UsageError without one."""
         known = {str(result.index): result for result in self._results}
         if text not in known:
             raise UsageError(f"scan {text or '?'} is none of the run's, which are {min(known)} to {max(known)}")
@@ -258,6 +260,7 @@ class GraphJob:
                 self._child.wait()
 
     def _read(self) -> None:
+        """Collect the child's lines of output, in a thread."""
         assert self._child.stderr is not None
         with contextlib.suppress(ValueError):
             for line in self._child.stderr:

@@ -41,7 +41,7 @@ ALWAYS = {
 
 
 class RefusedError(Exception):
-    """A request that is not answered as it wishes."""
+    """A request that the server rejects, with an HTTP status."""
 
     def __init__(self, status: HTTPStatus, message: str = "") -> None:
         super().__init__(message or status.phrase)
@@ -98,7 +98,7 @@ class RunServer(ThreadingHTTPServer):
         return f"http://{self.names[0]}/{self.token}/"
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """A browser that goes away while it is answered is no error."""
+        """Ignore errors of connections: a browser that closes one while it is answered is no fault."""
         log.debug("view: a connection ended", exc_info=True)
 
 
@@ -115,7 +115,7 @@ class _Handler(BaseHTTPRequestHandler):
         self._answer(self._get)
 
     def do_HEAD(self) -> None:
-        """The same without its content."""
+        """Answer as GET, without the content."""
         self._answer(self._get)
 
     def do_POST(self) -> None:
@@ -123,7 +123,7 @@ class _Handler(BaseHTTPRequestHandler):
         self._answer(self._post)
 
     def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
-        """Answer as JSON what is refused before it comes here: methods that no page uses, and what is no request."""
+        """Answer a rejected request, such as an unsupported method, with a status and a message in JSON."""
         is_method = code == HTTPStatus.NOT_IMPLEMENTED
         status = HTTPStatus.METHOD_NOT_ALLOWED if is_method else HTTPStatus(code)
         self.close_connection = True
@@ -131,7 +131,7 @@ class _Handler(BaseHTTPRequestHandler):
         self._send(status, replace(answer, headers=(("Allow", "GET, HEAD, POST"),) if is_method else ()))
 
     def log_message(self, format: str, *args: Any) -> None:  # noqa: A002
-        """The log of lslam alone; addresses have the token in them."""
+        """Write requests to the debug log of lslam alone, since addresses contain the token."""
         log.debug("view: %s", (format % args).replace(self.server.token, "TOKEN"))
 
     def _answer(self, method: Callable[[], Answer]) -> None:
@@ -227,6 +227,7 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 def _json(document: Any) -> Answer:
+    """Answer with a document as JSON."""
     return Answer("application/json", json.dumps(strict(document), allow_nan=False).encode())
 
 

@@ -113,6 +113,7 @@ class ViewedSites:
         return self._state(number)
 
     def _end(self, number: int) -> dict[str, Any]:
+        """Stop a running `lslam graph`. Returns the state."""
         if self._job is not None:
             self._job.stop()
         return self._state(number)
@@ -186,10 +187,12 @@ def require_page(folder: Path) -> None:
 
 
 def _refuse(folder: Path, document: Any) -> None:
+    """Raise UsageError: a merge cannot be corrected on its page."""
     raise UsageError(f"{folder} {MERGE_REFUSAL}")
 
 
 def _page(text: str, rules: str) -> Answer:
+    """Answer with a page and its content security policy."""
     return Answer("text/html; charset=utf-8", text.encode(), headers=(("Content-Security-Policy", rules),))
 
 
@@ -208,12 +211,12 @@ class MapTiles:
         self._thread = threading.Thread(target=copy_context().run, args=(self._build,), name="lslam-tiles", daemon=True)
 
     def start(self) -> None:
-        """Begin, unless there is to be none."""
+        """Find or build the octree in a thread, unless `why_not` says that there can be none."""
         if "error" not in self._said:
             self._thread.start()
 
     def stop(self) -> None:
-        """End the building, and leave nothing of it."""
+        """Stop the thread and delete the unfinished octree."""
         self._is_over.set()
         if self._thread.is_alive():
             self._thread.join()
@@ -276,6 +279,7 @@ class MapTiles:
                 os.replace(Path(place) / name, folder / name)
 
     def _on_share(self, share: float) -> None:
+        """Report the share of the octree that is written, 0 to 1. Raises InterruptedRunError after `stop`."""
         if self._is_over.is_set():
             raise InterruptedRunError("interrupted while tiles were built")
         self._said = {"share": share}
