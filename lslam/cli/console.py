@@ -29,9 +29,8 @@ if TYPE_CHECKING:
 class RemainingTime:
     """Estimate of the remaining time of `total` steps; `at_once` are made together, and one begins when another ends.
 
-    A running step counts with the usual duration less its elapsed time. Steps are taken to end in the order they began, since
-    a swap leaves the sum of their times unchanged. The first ones wait for kernels that are compiled: once there are others, they
-    do not count.
+    A running step counts with the usual duration less its elapsed time. Steps are taken to end in the order they began: a swap
+    leaves the sum of their times unchanged. The first steps, which wait for kernels that are compiled, do not count later.
     """
 
     def __init__(self, total: int, at_once: int = 1, clock: Callable[[], float] | None = None) -> None:

@@ -141,9 +141,7 @@ def _changes(curve: Curve) -> tuple[dict[str, float], float | None]:
     A stage that a timed run lacks counts as 0. Empty, and None, where fewer than 3 values were timed.
     """
     tables = {
-        name: np.where(curve.losses, np.nan, table)
-        for name, table in curve.stages.items()
-        if name not in NOT_REGISTRATION
+        n: np.where(curve.losses, np.nan, table) for n, table in curve.stages.items() if n not in NOT_REGISTRATION
     }
     if not tables:
         return {}, None

@@ -221,7 +221,10 @@ def extent(values: NDArray[Any]) -> tuple[Any, Any]:
 # without changing the order of sums. The result of a matrix that is not positive definite is NaN.
 @inline
 def _factorise(A: Floats, scale: Floats, L: Floats, column: Floats) -> None:
-    """Cholesky factor: L (N, N) lower triangular with L L^T = S A S; the scaling S = diag(`scale`) (N,) is computed first."""
+    """Write the Cholesky factor of A (N, N), scaled to a unit diagonal, into L (N, N), lower triangle: L L^T = S A S.
+
+    scale : (N,) takes the diagonal of S, 1 / sqrt(A_ii); column : (N,) workspace
+    """
     n = len(A)
     for i in range(n):
         scale[i] = 1.0 / math.sqrt(A[i, i])
