@@ -94,10 +94,8 @@ def _law(finding: ExpectedFinding, law: Law | None) -> Judged:
     other, r2 = rival(law)
     if law.r2 >= least:
         if r2 > law.r2 - _EQUAL:
-            return (
-                "undecided",
-                f"{said}, but {other} fits as well, with R2 {r2:.3f}: too few values, or too near each other",
-            )
+            said = f"{said}, but {other} fits as well, with R2 {r2:.3f}: too few values, or too near each other"
+            return "undecided", said
         return "confirmed", said
     if r2 >= least:
         return "refuted", f"{said}; {other} has R2 {r2:.3f}"
@@ -152,9 +150,8 @@ def _changes(curve: Curve) -> tuple[dict[str, float], float | None]:
     means = {
         name: over_seeds(np.where(timed, np.nan_to_num(table), np.nan)).mean[values] for name, table in tables.items()
     }
-    return {name: float(np.ptp(mean)) for name, mean in means.items()}, float(
-        np.sum([m.mean() for m in means.values()])
-    )
+    level = float(np.sum([mean.mean() for mean in means.values()]))
+    return {name: float(np.ptp(mean)) for name, mean in means.items()}, level
 
 
 def _own_share(finding: ExpectedFinding, change: dict[str, float]) -> float:
