@@ -251,7 +251,7 @@ def _graph(inputs: BackEndInput, inertial: InertialChain | None) -> PoseGraph:
         known = [k.T_world_lidar for k in store.keyframes]
         steps = [se3.relative(a, b) for a, b in pairwise(known)]
         fitness = [_fitness(store, k, k + 1, T) for k, T in enumerate(checking(steps))]
-    ups = up_directions(store.keyframes, results, config.graph) if config.graph.gravity else []
+    ups = up_directions(store.keyframes, results, config.graph) if config.graph.gravity_deg > 0 else []
     up = world_up(ups, store.keyframes)
     poses = np.stack([k.T_world_lidar for k in store.keyframes])
     distances = np.array([k.distance for k in store.keyframes])

@@ -12,7 +12,7 @@ from lslam.core.types.scan_result import ScanEquations
 from lslam.odometry.fast_lio import FastLio2
 from lslam.odometry.icp import registration_of
 from lslam.odometry.inertial.filter import warm_up_solver
-from lslam.odometry.inertial.window import WindowMotion
+from lslam.odometry.inertial.window import WINDOW_SCANS, WindowMotion
 from lslam.registration.optimiser import KERNEL_MIN_M, normal_equations
 from lslam.registration.preprocessing.prepare import PreparedPoints
 from lslam.registration.registration import Registration
@@ -21,7 +21,7 @@ from lslam.registration.result import RegistrationResult
 
 def create(config: Config) -> LioMapping:
     """The method as the configuration wants it: point to plane, with no recovery beside the window."""
-    return LioMapping(registration_of(config, recovery=rest_alone(config.recovery)), config.lio_mapping.window - 1)
+    return LioMapping(registration_of(config, recovery=rest_alone(config.recovery)), WINDOW_SCANS - 1)
 
 
 create_motion = WindowMotion

@@ -47,7 +47,7 @@ from lslam.osm.buildings_geojson import corrected_osm, write_buildings_geojson
 from lslam.osm.kernels import wall_matching
 from lslam.osm.overlap import Separation, remove_overlaps
 from lslam.osm.wall_match import LIKENESS
-from lslam.osm.walls import planar_sigmas, walls_of
+from lslam.osm.walls import BUILDING_RATIO, planar_sigmas, walls_of
 
 VIEWS = 3  # keyframes that must agree
 SEEN_WALL_M = 1.5  # m; a building with walls seen within it of its outline is not absent
@@ -277,7 +277,7 @@ def map_prior(matches: OsmMatches, config: OsmConfig) -> MapPrior:
 def _unseen(config: OsmConfig) -> MapPrior:
     """The map's prior for buildings that no scan saw: no shift, the configured sigmas."""
     shift_sigma = np.maximum(np.full(2, config.shift_sigma), TOGETHER[:2])
-    return MapPrior(np.zeros(2), shift_sigma, planar_sigmas(config.building_sigma))
+    return MapPrior(np.zeros(2), shift_sigma, planar_sigmas(BUILDING_RATIO * config.map_sigma))
 
 
 def write_buildings(folder: Path, corrected_map: CorrectedMap, data: OsmData) -> None:

@@ -26,6 +26,7 @@ from lslam.osm.location import MapLocations, finish, locate
 from lslam.osm.source import OsmSource
 from lslam.osm.wall_drift import WallDrift, WallSightings, find_wall_drift, without_drift
 from lslam.osm.wall_match import match_buildings
+from lslam.osm.walls import BUILDING_RATIO
 
 log = logging.getLogger("lslam")
 # Iterations of the drift estimate: the drift within a submap is not visible in its walls at first.
@@ -177,7 +178,7 @@ def _wall_sigmas(config: OsmConfig) -> tuple[float, float]:
     if config.mode in RIGID_MODES:
         # The points of a wall are uniform within the tolerance.
         return config.wall_tolerance / np.sqrt(3.0), SURVEY_SIGMA
-    return config.wall_sigma, config.building_sigma
+    return config.wall_sigma, BUILDING_RATIO * config.map_sigma
 
 
 def sightings(locations: MapLocations, poses: Floats, config: Config) -> WallSightings:

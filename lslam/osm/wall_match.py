@@ -20,7 +20,7 @@ from lslam.core.geometry import se2
 from lslam.core.types.building import BuildingMatch, KeyframeMatch
 from lslam.core.types.constraint import Verdict
 from lslam.osm.kernels import wall_matching
-from lslam.osm.walls import OsmMap, find_walls, planar_sigmas
+from lslam.osm.walls import BUILDING_RATIO, OsmMap, find_walls, planar_sigmas
 
 MIN_START_COVERAGE = 0.6  # share of the walls seen that must lie on the map where any heading is possible
 MIN_BUILDING_COVERAGE = 0.1  # share of a building's walls that must be seen
@@ -315,7 +315,7 @@ def match_buildings(
     found: list[BuildingMatch] = []
     if not len(match.walls):
         return found
-    sigma = planar_sigmas(config.building_sigma)
+    sigma = planar_sigmas(BUILDING_RATIO * config.map_sigma)
     own = config.of_one_building
     for number in osm.near(pose[:2] - shift, config.use_radius).tolist():
         middle = osm.buildings[number].middle

@@ -119,6 +119,8 @@ def find_walls(
 
 # What is a metre off is turned by so much, one sigma: 35 cm over 10 m, for outlines keep their shape better than their place.
 TURN_DEG_PER_M = 2.0
+# One sigma of a building over that of its neighbourhood on the map: buildings are drawn one by one.
+BUILDING_RATIO = 2.0
 
 
 def planar_sigmas(sigma_m: float) -> Floats:

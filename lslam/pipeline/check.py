@@ -96,14 +96,15 @@ def _check_imu(config: Config) -> None:
         raise UsageError(
             f"imu.velocity and imu.weigh are of the loosely coupled IMU, {method} weighs points and IMU together: drop them"
         )
-    if method == "lio-sam" and config.lio_sam.graph_imu and config.graph.imu_orientation:
+    if method == "lio-sam" and config.lio_sam.graph_imu and config.graph.imu_orientation_deg > 0:
         raise UsageError(
-            "graph.imu_orientation and lio_sam.graph_imu both bring the gyroscope's turns into the pose graph: set one to false"
+            "graph.imu_orientation_deg and lio_sam.graph_imu both bring the gyroscope's turns into the pose graph: drop the "
+            "former, or set lio_sam.graph_imu to false"
         )
-    if method == "lio-sam" and config.lio_sam.graph_imu and not config.graph.gravity:
+    if method == "lio-sam" and config.lio_sam.graph_imu and config.graph.gravity_deg == 0:
         raise UsageError(
-            "graph.gravity = false leaves gravity out of the pose graph, lio_sam.graph_imu brings it in: set both to false, or "
-            "drop the first"
+            "graph.gravity_deg = 0 leaves gravity out of the pose graph, lio_sam.graph_imu brings it in: drop the former, or set "
+            "lio_sam.graph_imu to false"
         )
     if (config.imu.estimate_offset or config.imu.estimate_extrinsics) and config.imu.velocity != "registration":
         raise UsageError(

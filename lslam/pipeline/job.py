@@ -115,7 +115,7 @@ def prepare(
         with_attributes(scans, config)  # before the odometry and not after it
     osm = open_osm(sequence, config)
     manual = read_manual(config, scans)
-    manifest, store = Manifest(command, scans, config), KeyframeStore(deflate=config.keyframes.deflate)
+    manifest, store = Manifest(command, scans, config), KeyframeStore()
     return PreparedRun(scans, odometry, config, truth, poses, manifest, watch, osm, manual, store, wheels=wheels)
 
 

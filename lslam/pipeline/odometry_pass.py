@@ -171,7 +171,7 @@ def _chain(inertial: Inertial, store: KeyframeStore, config: Config) -> Inertial
 
 def _turns(inertial: Inertial, store: KeyframeStore, config: Config) -> list[Turn]:
     """The gyroscope's rotations between successive keyframes, if the graph is to contain them."""
-    if inertial.motion is None or not config.graph.imu_orientation:
+    if inertial.motion is None or config.graph.imu_orientation_deg == 0:
         return []
     sigma = float(np.deg2rad(config.graph.imu_orientation_deg))
     found = []

@@ -32,7 +32,7 @@ from lslam.pipeline.job import is_open
 from lslam.pipeline.run_folder import MANIFEST
 
 # Keys that change no byte of the result, or only which of its metrics are shown.
-FREE = ("input.threads", "odometry.checkpoint_s", "keyframes.deflate", "eval.metrics")
+FREE = ("input.threads", "odometry.checkpoint_s", "eval.metrics")
 # What it means that a digest of `run_identity` is another.
 INPUTS = {
     "input": "the recording or its ground truth is another or was changed",

@@ -209,7 +209,7 @@ def _begin(job: PreparedRun, folder: RunFolder, goes_on: bool, earlier: EarlierR
     if earlier is not None:
         folder.begin_from(earlier.folder)
     folder.write_manifest(job.manifest.as_dict("running"))
-    store = KeyframeStore(folder.path / KEYFRAMES, deflate=job.config.keyframes.deflate)
+    store = KeyframeStore(folder.path / KEYFRAMES)
     checkpoints = odometry_checkpoints(folder, job, goes_on or earlier is not None)
     if earlier is not None and (checkpoints is None or not checkpoints.is_over):
         raise InputError("the state of the run's odometry is damaged or incomplete: run the sequence again")

@@ -68,7 +68,7 @@ FURTHER = (
     Quantity("share of inliers", "inlier_share"),
 )
 # Kept of the runs: what they wrote for people is not read here.
-_ALWAYS = ("map.write=false", "report.html=false", "keyframes.deflate=0", "eval.metrics=['thesis']")
+_ALWAYS = ("map.write=false", "report.html=false", "eval.metrics=['thesis']")
 MAPS = "maps"
 HARD = "-hard"
 # Between a system and the map that it is given.

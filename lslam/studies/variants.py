@@ -25,11 +25,9 @@ WITH_IMU = "+imu"
 # Methods that bring their own preprocessing and so never draw by `preprocess.seed`.
 DRAW_NOTHING = ("kiss-icp", "small-gicp", "open3d-gicp", "loam-odom", "loam", "floam", "lego-loam")
 
-# One thread: a run then keeps one core busy, as many go at once as there are cores, and times mean the same. Keyframes go
-# with the run that made them, so they are not packed.
+# One thread: a run then keeps one core busy, as many go at once as there are cores, and times mean the same.
 _ALWAYS = (
     "input.threads=1",
-    "keyframes.deflate=0",
     "map.write=false",
     "map.write_features=false",
     "report.html=false",

@@ -328,7 +328,7 @@ def test_gravity_keeps_it_level_beside_loops() -> None:
         for i in range(COUNT)
     ]  # fmt: skip
     done = run_back_end(Stub([]), results, store_of(results), config(), LOOPS[:1])
-    blind = run_back_end(Stub([]), results, store_of(results), config("graph.gravity=false"), LOOPS[:1])
+    blind = run_back_end(Stub([]), results, store_of(results), config("graph.gravity_deg=0"), LOOPS[:1])
 
     assert tilt(done) < 0.6 * tilt(blind)
     # The start stays where it was: the world's up is found, not forced on it.
@@ -353,7 +353,7 @@ def test_gravity_takes_a_tilt_away_without_any_loop(seed: int) -> None:
     results = with_gravity(drifted(*level, tilt_deg_per_100m=0.5), seed)
     store = store_of(results)
     done = run_back_end(Stub([]), results, store, config(), [])
-    blind = run_back_end(Stub([]), results, store, config("graph.gravity=false"), [])
+    blind = run_back_end(Stub([]), results, store, config("graph.gravity_deg=0"), [])
     assert blind.results is results
     assert tilt(done) < 0.4 * tilt(blind)
     assert error(done) < 0.85 * error(blind)

@@ -66,8 +66,8 @@ def test_fixes_err_together_only_where_they_state_more_than_they_scatter(
 def test_fixes_that_err_together_enter_keyframe_by_keyframe_too() -> None:
     results = drifted("debug.drift_percent=0", "debug.drift_deg_per_100m=0")[:150]
     found = []
-    for way in ("true", "false"):
-        given = config("gnss.mode=graph", f"graph.incremental={way}")
+    for way in ("isam2", "lm"):
+        given = config("gnss.mode=graph", f"graph.optimizer={way}")
         done = run_back_end(wandering(0), results, store_of(results), given, [])
         assert "wandering_fixes" in done.facts
         found.append(np.stack([r.T_world_lidar for r in done.results]))

@@ -73,7 +73,7 @@ def drive(name: str, scans: int, seed: int, scale: float, turn: float) -> tuple[
             step[:3, 3] *= 1 + scale / 100
             odometry = odometry @ step @ se3.make(so3.exp(np.array([0.0, 0.0, bend])), np.zeros(3))
         still = MotionPrior.at_once(np.eye(4))
-        cloud = keyframe_cloud(sequence.scan(i), still, PreprocessConfig(), config)
+        cloud = keyframe_cloud(sequence.scan(i), still, PreprocessConfig())
         stamp = int(sequence.stamps_ns[i])
         store.add(Keyframe(len(chosen), i, stamp, odometry, None, float(travelled[i])), cloud)
         chosen.append(i)

@@ -18,7 +18,7 @@ from osm import SPACING, true_poses
 
 from lslam.backend.keyframes.store import KeyframeStore
 from lslam.core.config import Config
-from lslam.core.config.backend import KeyframesConfig, OsmConfig
+from lslam.core.config.backend import OsmConfig
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.geometry import se2
 from lslam.core.types.building import KeyframeMatch
@@ -43,7 +43,7 @@ def measured(drive: Path, count: int, size: int) -> dict[str, list[float]]:
     sequence, store = open_sequence(drive), KeyframeStore()
     for k, scan in enumerate(scans.tolist()):
         still = MotionPrior.at_once(poses[scan])
-        cloud = keyframe_cloud(sequence.scan(scan), still, PreprocessConfig(), KeyframesConfig())
+        cloud = keyframe_cloud(sequence.scan(scan), still, PreprocessConfig())
         store.add(Keyframe(k, scan, scan, poses[scan], None, float(way[scan])), cloud)
     config, osm = OsmConfig(), OsmMap(read_buildings(drive / "map.osm", origin)[1].buildings)
     warm_up()

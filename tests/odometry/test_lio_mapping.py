@@ -22,7 +22,7 @@ from lslam.odometry.frontend.checkpoints import STATE_CLASSES
 from lslam.odometry.frontend.inertial_start import begin_inertial
 from lslam.odometry.frontend.register_scans import read_ahead
 from lslam.odometry.frontend.tracker import ScanInput, Tracker
-from lslam.odometry.inertial.window import WindowMotion
+from lslam.odometry.inertial.window import WINDOW_SCANS, WindowMotion
 from lslam.odometry.lio_mapping import LioMapping
 from lslam.pipeline.check import check_config
 from lslam.simulation.lidar_models import LIDARS
@@ -30,7 +30,6 @@ from lslam.simulation.scenarios import simulate
 
 pytestmark = pytest.mark.usefixtures("shared_first_poses")
 QUIET = ("map.write=false", "report.html=false", "loops.use=false", "imu.start_s=1")
-WINDOW = 5
 
 
 def config_of(method: str, *settings: str) -> Config:
@@ -38,7 +37,7 @@ def config_of(method: str, *settings: str) -> Config:
 
 
 def windowed() -> Config:
-    return config_of("lio-mapping", f"lio_mapping.window={WINDOW}")
+    return config_of("lio-mapping")
 
 
 @cache
@@ -82,7 +81,7 @@ def test_the_map_is_of_scans_that_left_the_window_and_a_run_goes_on_where_it_was
         expected.append(tracker.track(scan).T_world_lidar)
         assert motion.window is not None
         stamps = [m.stamp_ns for m in motion.window.moments]
-        assert stamps == [one.stamp_ns for one in loaded[max(0, k + 1 - WINDOW) : k + 1]]
+        assert stamps == [one.stamp_ns for one in loaded[max(0, k + 1 - WINDOW_SCANS) : k + 1]]
         # All scans but the first have equations, and each is in the map or waits for it.
         assert all(m.equations is not None for m in motion.window.moments if m.stamp_ns != loaded[0].stamp_ns)
         assert odometry.registration.history.inserted + len(odometry.pending) == k + 1
@@ -90,7 +89,7 @@ def test_the_map_is_of_scans_that_left_the_window_and_a_run_goes_on_where_it_was
         if k == 11:
             write_state(tmp_path / "12.npz", tracker.state())
     # One more waits in the window than enters the map while it fills.
-    assert len(odometry.pending) == WINDOW - 1
+    assert len(odometry.pending) == WINDOW_SCANS - 1
     again, _, _ = tracker_of(sequence, config)
     again.restore(read_state(tmp_path / "12.npz", STATE_CLASSES))
     np.testing.assert_array_equal([again.track(scan).T_world_lidar for scan in loaded[12:]], expected[12:])

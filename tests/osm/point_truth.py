@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.core.config.backend import KeyframesConfig
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.geometry import se2, se3
 from lslam.core.labels import CLASSES
@@ -43,7 +42,7 @@ def submap_of(
         parts = []
         for k in numbers.tolist():
             scan = drive.scan(k)
-            given = scan, MotionPrior.at_once(np.eye(4)), PreprocessConfig(), KeyframesConfig()
+            given = scan, MotionPrior.at_once(np.eye(4)), PreprocessConfig()
             labels = keyframe_labels(*given)
             assert labels is not None
             parts.append((se3.apply(se3.relative(level, poses[k]), keyframe_cloud(*given)), labels))

@@ -52,7 +52,7 @@ def test_a_building_is_matched_under_a_common_shift_of_the_map() -> None:
     """Everything stands 2.4 m off the map; sought with that known, each house is found there."""
     shift = np.array([2.0, -1.3])
     match = view(TOWN.walls + shift)
-    found = match_buildings(match, np.zeros(3), shift, TOWN, OsmConfig(building_sigma=0.3))
+    found = match_buildings(match, np.zeros(3), shift, TOWN, OsmConfig(map_sigma=0.15))
     assert [one.building for one in found if one.verdict == "accepted"] == [0, 1, 2]
     for one in found:
         moved = one.displacement(np.zeros(3), TOWN.buildings[one.building].middle)

@@ -13,7 +13,6 @@ from wall_scenes import misfit, noisy, plain, upright
 import lslam
 from lslam.backend.keyframes.store import KeyframeStore, PartOfStore, submap, submap_labels
 from lslam.core.config import Config, load_config
-from lslam.core.config.backend import KeyframesConfig
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.errors import InputError
 from lslam.core.types.motion_prior import MotionPrior
@@ -60,7 +59,7 @@ def labelled_scan(seed: int) -> tuple[Scan, NDArray[np.uint16]]:
 @pytest.mark.parametrize("is_on_disk", [False, True])
 def test_keyframes_keep_the_classes_of_their_points(is_on_disk: bool, tmp_path: Path) -> None:
     store = KeyframeStore(tmp_path / "keyframes" if is_on_disk else None, cache_size=1)
-    given = MotionPrior.at_once(np.eye(4)), PreprocessConfig(), KeyframesConfig()
+    given = MotionPrior.at_once(np.eye(4)), PreprocessConfig()
     for k in range(3):
         scan, _ = labelled_scan(k)
         scan = scan if k != 1 else Scan(scan.points, 0, 1)

@@ -137,14 +137,14 @@ def test_a_key_that_the_method_would_pass_over_is_refused(method: str, setting: 
     [("lio-sam", ("recovery.fallback=all-points",), r"recovery\.fallback = 'all-points' .* method lio-sam.*\(loam-odom, loam"),
      ("lio-sam", ("lio_sam.features=points", "registration.keyframes=5"), "method lio-sam: drop it, or"),
      ("lio-sam", ("registration.keyframe_deg=5",), "method lio-sam: drop it, or"),
-     ("lio-sam", ("graph.gravity=false",), r"^graph\.gravity = false .* lio_sam\.graph_imu brings it in"),
-     ("lio-sam", ("graph.gravity=false", "lio_sam.graph_imu=false"), ""),
+     ("lio-sam", ("graph.gravity_deg=0",), r"^graph\.gravity_deg = 0 .* lio_sam\.graph_imu brings it in"),
+     ("lio-sam", ("graph.gravity_deg=0", "lio_sam.graph_imu=false"), ""),
      ("ct-icp", ("registration.keyframe_m=1",), "method ct-icp: drop it, or"),
      ("lips", ("recovery.fallback=all-points",), "method lips"),
      ("lio-mapping", ("recovery.fallback=all-points",), "method lio-mapping"),
      ("ct-icp", ("recovery.fallback=all-points",), "method ct-icp"), ("icp", ("recovery.fallback=all-points",), "method icp"),
      ("loam-livox", ("recovery.fallback=all-points",), ""), ("lio-sam", ("recovery.start_search=false",), ""),
-     ("lips", ("graph.gravity=false",), ""), ("icp", ("registration.keyframes=5",), "")],
+     ("lips", ("graph.gravity_deg=0",), ""), ("icp", ("registration.keyframes=5",), "")],
 )  # fmt: skip
 def test_what_a_method_overrides_is_refused_and_what_it_does_anyway_is_not(
     method: str, settings: tuple[str, ...], words: str

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import zipfile
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -278,12 +277,8 @@ def test_another_configuration_is_refused_and_what_changes_nothing_is_not(begun:
         lslam.run(drive(), config_of("map.write=false", "registration.sigma=0.05"), out=out, resume=True)
     assert refused.value.exit_code == 2
     assert result_of(out) == before, "what was refused is left alone"
-    free = ("input.threads=1", "keyframes.deflate=0")
-    lslam.run(drive(), config_of("map.write=false", *free), out=out, resume=True)
+    lslam.run(drive(), config_of("map.write=false", "input.threads=1"), out=out, resume=True)
     assert manifest(out)["status"] == "degraded"
-    clouds = sorted((out / "keyframes").glob("0*.npz"))
-    members = [zipfile.ZipFile(clouds[k]).namelist() for k in (0, -1)]
-    assert members == [["planes.zst.npy"], ["planes.npy"]], "packed as was asked when each was made"
 
 
 @pytest.mark.parametrize(

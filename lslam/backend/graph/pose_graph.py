@@ -221,7 +221,7 @@ def optimise(graph: PoseGraph, config: GraphConfig) -> Solution:
         for prior in graph.map_priors
     ]
     values = factors.start_values(graph, graph.poses)
-    if config.incremental:
+    if config.optimizer == "isam2":
         everything = join_factors(fixed, [item.make(1.0, None) for item in candidates])
         values = solve_incrementally(everything, values, len(graph))
     solved = gnc_solve(fixed, candidates, values, config)

@@ -32,6 +32,8 @@ from lslam.registration.preprocessing.prepare import NO_TIMES
 Labels = NDArray[np.uint16]
 INDEX = "index.npz"
 CACHE_CLOUDS = 32
+# Of zstd: at a higher level clouds are hardly smaller, and take longer.
+PACKING_LEVEL = 1
 # Ends the names of arrays whose bytes are a frame of zstd.
 ZST = ".zst"
 
@@ -43,7 +45,7 @@ class KeyframeStore(Stateful):
     for the clouds. A folder that has an index is opened with what it holds. Several threads may ask for points.
 
     folder : created when the first cloud is added; None keeps the packed clouds in memory
-    cache_size : clouds in memory; deflate : how much clouds are packed, from 0, not at all, to 9
+    cache_size : clouds in memory
 
     Raises InputError for an index or a cloud that is damaged or missing, OutputError for what cannot be written.
 
@@ -53,13 +55,13 @@ class KeyframeStore(Stateful):
     (1, [[1.0, 1.0, 1.0], [1.0, 1.0, 1.0]])
     """
 
-    def __init__(self, folder: Path | None = None, cache_size: int = CACHE_CLOUDS, deflate: int = 1) -> None:
+    def __init__(self, folder: Path | None = None, cache_size: int = CACHE_CLOUDS) -> None:
         self.folder = folder
         self.keyframes: list[Keyframe] = []
         # The number by which the cloud of each was added.
         self._files: list[int] = []
         self._memory: dict[int, bytes] = {}
-        self._cached, self._deflate = cache_size, deflate
+        self._cached = cache_size
         self._recent: OrderedDict[int, tuple[Points, Labels | None]] = OrderedDict()
         self._lock = threading.Lock()
         if folder is not None and (folder / INDEX).exists():
@@ -80,14 +82,14 @@ class KeyframeStore(Stateful):
         # Byte by byte and axis by axis: what is alike lies side by side, and zstd takes it down to half.
         planes = np.ascontiguousarray(cloud.T).view(np.uint8).reshape(3, len(cloud), 4).transpose(2, 0, 1)
         arrays: dict[str, NDArray[Any]] = {"planes": planes} if labels is None else {"planes": planes, "labels": labels}
-        arrays = _pack(arrays, self._deflate) if self._deflate else arrays
+        packed = _pack(arrays)
         if self.folder is None:
             stream = io.BytesIO()
-            pack_npz(stream, arrays, 0)
+            pack_npz(stream, packed, 0)
             self._memory[keyframe.number] = stream.getvalue()
         else:
             _make(self.folder)
-            write_npz(self._path(keyframe.number), arrays, 0)
+            write_npz(self._path(keyframe.number), packed, 0)
         self.keyframes.append(keyframe)
         self._files.append(keyframe.number)
         self._keep(keyframe.number, cloud, labels)
@@ -198,10 +200,13 @@ class PartOfStore(KeyframeStore):
         return self._store.labels(self.whole[number].number)
 
 
-def _pack(arrays: Mapping[str, NDArray[Any]], level: int) -> dict[str, NDArray[np.uint8]]:
+def _pack(arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[np.uint8]]:
     """The bytes of the arrays as frames of zstd, which packs seven times and unpacks three times as fast as deflate."""
     compress = zstd().compress
-    return {f"{name}{ZST}": np.frombuffer(compress(array.tobytes(), level), np.uint8) for name, array in arrays.items()}
+    return {
+        f"{name}{ZST}": np.frombuffer(compress(array.tobytes(), PACKING_LEVEL), np.uint8)
+        for name, array in arrays.items()
+    }
 
 
 def _unpack(arrays: dict[str, NDArray[Any]], name: str) -> dict[str, NDArray[Any]]:

@@ -82,7 +82,7 @@ class Detector:
         # Submaps overlap: the first keyframe of every few metres represents those after it.
         steps = np.floor(self.uncertainty.distances / (NEAR_M / 2))
         self._is_described = np.diff(steps, prepend=-1.0) > 0
-        bound = config.memory_places if config.memory == "bounded" else None
+        bound = config.memory_places
         places = np.cumsum(self._is_described) - 1
         self.memory = WorkingMemory(places, self.uncertainty.distances, bound, config.min_travel)
 
@@ -96,7 +96,7 @@ class Detector:
         count = len(self.keyframes)
         if any(len(self._gate(b)) for b in range(count)):
             self._level_world()
-            if self.config.memory == "bounded" and self.config.rehearsal is not None:
+            if self.config.memory_places is not None and self.config.rehearsal is not None:
                 places = self._rehearse(1.0 - self.config.rehearsal, should_stop)
                 self.memory = WorkingMemory(
                     places, self.uncertainty.distances, self.config.memory_places, self.config.min_travel

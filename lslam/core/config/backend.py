@@ -15,13 +15,6 @@ class KeyframesConfig(Section):
 
     distance: float = Field(2.0, gt=0, description="m; way since the last keyframe")
     angle_deg: float = Field(15.0, gt=0, description="deg; turn since the last keyframe")
-    voxel: float = Field(0.3, ge=0.05, description="m; one averaged point per voxel is kept of a keyframe's scan")
-    deflate: int = Field(
-        1,
-        ge=0,
-        le=9,
-        description="how much the clouds on disk are packed: 0 not at all, quickest, twice the size; 9 most",
-    )
     submap_size: int = Field(5, ge=1, description="keyframes whose clouds make one submap, about the one in the middle")
 
 
@@ -55,13 +48,11 @@ class LoopsConfig(Section):
     descriptor: str = Field(
         "scan-context", description="by which places are told alike: scan-context, or a plug-in's name"
     )
-    memory: Literal["all", "bounded"] = Field(
-        "all",
-        description="which older places are compared: all, or a working memory of bounded size (Labbé and Michaud 2013), so "
-        "that the time per keyframe does not grow with the run",
-    )
-    memory_places: int = Field(
-        500, ge=20, description="places, 4 m of way each, in the working memory of `loops.memory = bounded`"
+    memory_places: int | None = Field(
+        None,
+        ge=20,
+        description="older places, 4 m of way each, in a working memory of bounded size (Labbé and Michaud 2013), so that the "
+        "time per keyframe does not grow with the run: 500 are 2 km; absent: all are compared",
     )
     rehearsal: float | None = Field(
         None,
@@ -94,10 +85,10 @@ class GraphConfig(Section):
     """The optimisation of keyframe poses."""
 
     control: str = Field("", description="CSV of control points, surveyed positions that hold the poses; empty: none")
-    optimizer: Literal["lm", "dogleg"] = Field(
-        "lm", description="Levenberg-Marquardt, or Powell's dog leg (trust region)"
+    optimizer: Literal["lm", "dogleg", "isam2"] = Field(
+        "lm",
+        description="Levenberg-Marquardt, Powell's dog leg (trust region), or iSAM2, keyframe by keyframe, before the former",
     )
-    incremental: bool = Field(False, description="solve keyframe by keyframe with iSAM2 before the final optimisation")
     robust: Literal["gnc", "huber", "cauchy", "none"] = Field(
         "gnc", description="how wrong loops and fixes are told: graduated non-convexity, an M-estimator, not at all"
     )
@@ -114,10 +105,17 @@ class GraphConfig(Section):
     refine: bool = Field(
         False, description="then correct all scans at once, so that what they saw of a plane lies on one (--refine)"
     )
-    gravity: bool = Field(True, description="with an IMU: hold each keyframe's up direction to what it measured")
-    gravity_deg: float = Field(0.3, gt=0, description="deg; one sigma of that direction: 0.05 m/s2 of bias are 0.3 deg")
-    imu_orientation: bool = Field(False, description="with an IMU: hold turns between keyframes to the gyroscope's")
-    imu_orientation_deg: float = Field(0.2, gt=0, description="deg; one sigma of such a turn")
+    gravity_deg: float = Field(
+        0.3,
+        ge=0,
+        description="deg; with an IMU: hold each keyframe's up direction to what it measured, with this sigma: 0.05 m/s2 of bias "
+        "are 0.3 deg; 0: do not",
+    )
+    imu_orientation_deg: float = Field(
+        0.0,
+        ge=0,
+        description="deg; with an IMU: hold turns between keyframes to the gyroscope's, with this sigma, as 0.2; 0: do not",
+    )
     floor: bool = Field(False, description="hold keyframes to one floor plane, for flat ground only (hdl_graph_slam)")
     floor_is_flat: bool = Field(
         True, description="only where nearly all of it is one plane; false: whatever it is, as hdl_graph_slam does"
@@ -210,10 +208,8 @@ class OsmConfig(Section):
     map_sigma: float = Field(
         0.5,
         gt=0,
-        description="m; one sigma by which a neighbourhood of the map is off by itself, and turned: by 2 deg per m",
-    )
-    building_sigma: float = Field(
-        1.0, gt=0, description="m; one sigma by which a building of the map is off, and turned likewise"
+        description="m; one sigma by which a neighbourhood of the map is off by itself, and a building by twice as much, and "
+        "turned: by 2 deg per m",
     )
     server: str = Field(
         "https://overpass-api.de/api/interpreter",
@@ -301,22 +297,19 @@ class DebugConfig(Section):
     drift_memory: float | None = Field(
         None, gt=0, description="m; way over which both are forgotten and drawn anew; absent: they never change"
     )
-    drift_estimate: str = Field(
-        "",
-        description="`recorded`: trajectory of that run, in any format that `eval` reads; where it ends its errors begin anew",
+    drift_recorded: tuple[str, str] | None = Field(
+        None,
+        description="`recorded`: trajectory of that run and its ground truth, in any format that `eval` reads; where they end "
+        "its errors begin anew",
     )
-    drift_truth: str = Field("", description="`recorded`: its ground truth")
 
     @model_validator(mode="after")
     def _check(self) -> Self:
         """Raise ValueError for keys that do not belong to the kind of drift."""
-        are_given = bool(self.drift_estimate), bool(self.drift_truth)
-        if self.drift_kind == "recorded" and not all(are_given):
-            raise ValueError(
-                "drift_kind = recorded takes drift_estimate and drift_truth, the two trajectories of a real run"
-            )
-        if self.drift_kind != "recorded" and any(are_given):
-            raise ValueError(f"drift_estimate and drift_truth are of drift_kind = recorded, not of {self.drift_kind}")
+        if self.drift_kind == "recorded" and not self.drift_recorded:
+            raise ValueError("drift_kind = recorded takes drift_recorded, the estimate and the truth of a real run")
+        if self.drift_kind != "recorded" and self.drift_recorded:
+            raise ValueError(f"drift_recorded is of drift_kind = recorded, not of {self.drift_kind}")
         if self.drift_kind != "rate" and self.drift_memory is not None:
             raise ValueError(f"drift_memory is of drift_kind = rate, not of {self.drift_kind}")
         return self

@@ -232,22 +232,30 @@ def _merge(tree: Tree, more: Tree, where: str, *, is_file: bool = False) -> None
     is_file : accept former keys with their fixed value, as the config.toml of an earlier run has them
     """
     for section, values in more.items():
-        if section not in Config.model_fields:
+        if section not in Config.model_fields and section not in former_keys():
             raise ConfigError(f"{where}: unknown section {section!r}; {nearest(section, Config.model_fields)}")
         if not isinstance(values, dict):
             raise ConfigError(f"{where}: {section!r} is a section, write {section}.key = value")
-        model = Config.model_fields[section].annotation
-        assert isinstance(model, type)
-        assert issubclass(model, BaseModel)
+        keys = _keys_of(section)
         for key, value in values.items():
-            if key in model.model_fields:
+            if key in keys:
                 tree.setdefault(section, {})[key] = value
                 continue
             former = former_keys().get(section, {}).get(key)
             if former is None:
-                raise ConfigError(f"{where}: unknown key {section}.{key}; {nearest(key, model.model_fields)}")
+                raise ConfigError(f"{where}: unknown key {section}.{key}; {nearest(key, keys)}")
             if not is_file or value != former.get("value"):
                 raise ConfigError(f"{where}: there is no {section}.{key} any more: {_outcome(**former)}")
+
+
+def _keys_of(section: str) -> tuple[str, ...]:
+    """The keys of a section; none of one of earlier versions."""
+    if section not in Config.model_fields:
+        return ()
+    model = Config.model_fields[section].annotation
+    assert isinstance(model, type)
+    assert issubclass(model, BaseModel)
+    return tuple(model.model_fields)
 
 
 @cache

@@ -193,17 +193,6 @@ class LioSamConfig(Section):
     )
 
 
-class LioMappingConfig(Section):
-    """How much of the past is estimated anew with every scan."""
-
-    window: int = Field(
-        7,
-        ge=2,
-        le=20,
-        description="scans whose poses, velocities and biases are estimated together, the newest included",
-    )
-
-
 Three = Annotated[tuple[float, ...], Field(min_length=3, max_length=3)]
 
 
@@ -288,7 +277,6 @@ class FrontEndConfig(Section):
     recovery: RecoveryConfig = RecoveryConfig()
     loam: LoamConfig = LoamConfig()
     lio_sam: LioSamConfig = LioSamConfig()
-    lio_mapping: LioMappingConfig = LioMappingConfig()
     imu: ImuConfig = ImuConfig()
     wheels: WheelsConfig = WheelsConfig()
 

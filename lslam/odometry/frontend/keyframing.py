@@ -65,30 +65,28 @@ class KeyframeSelector(Stateful):
 # m; centroids are rounded to it. A power of two, so that rounded numbers end in zeros and compress to half; its error,
 # 0.6 mm rms, is a fiftieth of a point's noise.
 GRAIN = 2.0**-9
+# m; one averaged point per voxel is kept of a keyframe's scan.
+KEYFRAME_VOXEL_M = 0.3
 
 
-def keyframe_cloud(
-    scan: Scan, motion: MotionPrior, preprocess: PreprocessConfig, config: KeyframesConfig
-) -> NDArray[np.float32]:
-    """Centroids (M, 3), m, of the scan's points in voxels of `keyframes.voxel`, LiDAR frame at the scan's stamp.
+def keyframe_cloud(scan: Scan, motion: MotionPrior, preprocess: PreprocessConfig) -> NDArray[np.float32]:
+    """Centroids (M, 3), m, of the scan's points in voxels of `KEYFRAME_VOXEL_M`, LiDAR frame at the scan's stamp.
 
     motion : of the sensor within the sweep; points are deskewed by it before they are averaged
 
     Range gate and ego box are odometry's. The ground stays in and nothing is denoised, whatever odometry prefers: what
     looks at keyframes wants to see the place.
     """
-    centroids = voxel.means(_within_gate(scan, motion, preprocess)[0], NO_TIMES, config.voxel)[0]
+    centroids = voxel.means(_within_gate(scan, motion, preprocess)[0], NO_TIMES, KEYFRAME_VOXEL_M)[0]
     return np.asarray(np.round(centroids / np.float32(GRAIN)) * np.float32(GRAIN), np.float32)
 
 
-def keyframe_labels(
-    scan: Scan, motion: MotionPrior, preprocess: PreprocessConfig, config: KeyframesConfig
-) -> NDArray[np.uint16] | None:
+def keyframe_labels(scan: Scan, motion: MotionPrior, preprocess: PreprocessConfig) -> NDArray[np.uint16] | None:
     """Classes (M,) of the points of `keyframe_cloud`, each that of the first point in its voxel; None where none are known."""
     if scan.labels is None:
         return None
     points, index = _within_gate(scan, motion, preprocess)
-    return np.asarray(scan.labels[index[voxel.first_points(points, config.voxel)]])
+    return np.asarray(scan.labels[index[voxel.first_points(points, KEYFRAME_VOXEL_M)]])
 
 
 def _within_gate(scan: Scan, motion: MotionPrior, preprocess: PreprocessConfig) -> tuple[NDArray[np.float32], Longs]:
@@ -191,7 +189,7 @@ class Keyframing(Stateful):
 
     def _write(self, keyframe: Keyframe, scan: Scan, motion: MotionPrior) -> None:
         """Make a keyframe's cloud and labels, and add them to the store."""
-        given = scan, motion, self._config.preprocess, self._config.keyframes
+        given = scan, motion, self._config.preprocess
         self.store.add(keyframe, keyframe_cloud(*given), keyframe_labels(*given))
 
     def _wait(self, most: int) -> None:

@@ -48,6 +48,8 @@ DOWN, AXES = slice(0, 3), slice(3, 12)
 # m and rad: a step of all poses below ends the iteration; what it leaves is its square.
 LEAST_STEP = 1e-3
 MOST_STEPS = 5
+# Whose poses, velocities and biases are estimated together, the newest included: what is older teaches little.
+WINDOW_SCANS = 7
 
 
 @dataclass(frozen=True)
@@ -303,17 +305,13 @@ STALE_M = 0.005
 
 
 class WindowMotion(FilterMotion):
-    """Predicts as the filter does, from the newest state; the joint estimate of the whole window replaces its update.
-
-    size : moments in the window between two scans
-    """
+    """Predicts as the filter does, from the newest state; the joint estimate of the whole window replaces its update."""
 
     HAS_DEVICE: ClassVar[bool] = False
     STATE: ClassVar[tuple[str, ...]] = (*FilterMotion.STATE, "window")
 
     def __init__(self, opening: InertialStart, config: Config) -> None:
         super().__init__(opening, config)
-        self.size = config.lio_mapping.window
         self.window: Window | None = None
         # Of the scan that is being registered: equations that were taken, and the window with it.
         self._equations: dict[int, ScanEquations] = {}
@@ -379,5 +377,5 @@ class WindowMotion(FilterMotion):
             self.window = self.window.extend(moment_of(self._now, self._instant_ns, stamp_ns, T_imu_scan))
         else:
             self.window = Window.begin(self._now, self._instant_ns, stamp_ns, T_imu_scan)
-        while self.window is not None and len(self.window.moments) > self.size:
+        while self.window is not None and len(self.window.moments) > WINDOW_SCANS:
             self.window = self.window.without_first(self.imu)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -96,7 +97,7 @@ def test_the_imu_halves_the_tilt_error_with_consistent_covariances() -> None:
     assert 0.3 < np.mean(consistency) < 2.0
 
 
-@pytest.mark.parametrize("settings", [{}, {"incremental": True}])
+@pytest.mark.parametrize("settings", [{}, {"optimizer": "isam2"}])
 def test_fixes_and_imu_together_are_better_than_fixes_alone(settings: dict[str, object]) -> None:
     graph, real = graph_and_truth(0)
     config = GraphConfig.model_validate(settings)
@@ -108,11 +109,11 @@ def test_fixes_and_imu_together_are_better_than_fixes_alone(settings: dict[str, 
     assert turned(held.poses, real) < 0.8 * turned(alone.poses, real)
 
 
-@pytest.mark.parametrize("incremental", [False, True])
-def test_a_gap_of_the_imu_leaves_odometry_alone_there(incremental: bool) -> None:
+@pytest.mark.parametrize("optimizer", ["lm", "isam2"])
+def test_a_gap_of_the_imu_leaves_odometry_alone_there(optimizer: Literal["lm", "isam2"]) -> None:
     graph, real = graph_and_truth(1)
     assert graph.inertial is not None
-    config = GraphConfig(incremental=incremental)
+    config = GraphConfig(optimizer=optimizer)
     # The second gap is at the begin, beyond the first keyframes that are taken in together.
     for gap in (range(15, 19), range(12)):
         kept = [one for one in graph.inertial.links if one.a not in gap]

@@ -33,7 +33,7 @@ def test_loops_take_the_drift_away() -> None:
     np.testing.assert_allclose(solution.poses[0], graph.poses[0], atol=1e-3)
 
 
-@pytest.mark.parametrize("settings", [{}, {"is_pairwise": False}, {"optimizer": "dogleg"}, {"incremental": True}])
+@pytest.mark.parametrize("settings", [{}, {"is_pairwise": False}, {"optimizer": "dogleg"}, {"optimizer": "isam2"}])
 def test_a_third_of_wrong_loops_changes_little(settings: dict[str, object]) -> None:
     rng = np.random.default_rng(2)
     graph = graph_of(REAL, 90, 27, rng, LAPS)
@@ -189,7 +189,7 @@ def test_one_floor_keeps_the_height() -> None:
     floors = [
         FloorPlane(k, np.array([0.0, 0.0, 1.0]), 1.7 + 0.02 * rng.normal(), 0.005, 0.05) for k in range(0, 240, 3)
     ]
-    solution = optimise(replace(graph, floors=floors), GraphConfig(incremental=True))
+    solution = optimise(replace(graph, floors=floors), GraphConfig(optimizer="isam2"))
     assert np.abs(solution.poses[:, 2, 3]).max() < 0.15 < np.abs(graph.poses[:, 2, 3]).max()
 
 

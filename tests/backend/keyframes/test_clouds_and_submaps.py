@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from lslam.backend.keyframes.store import KeyframeStore, neighbours, submap
-from lslam.core.config.backend import KeyframesConfig
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.geometry import se3
 from lslam.core.types.motion_prior import MotionPrior
@@ -16,7 +15,6 @@ from lslam.core.types.trajectory import Keyframe
 from lslam.odometry.frontend.keyframing import GRAIN, keyframe_cloud
 
 AT_ONCE = MotionPrior.at_once(np.eye(4))
-CONFIG = KeyframesConfig(voxel=0.3)
 
 
 def centroids(points: NDArray[np.float32], voxel: float) -> NDArray[np.float64]:
@@ -32,7 +30,7 @@ def test_one_centroid_per_voxel_and_what_is_no_measurement_stays_out() -> None:
     good = good[np.linalg.norm(good, axis=1) > 1.0]
     bad = np.array([[0, 0, 0], [np.nan] * 3, [0.1, 0.1, 0], [500, 0, 0], [np.inf, 0, 0], [5, 5, 5]], np.float32)
     preprocess = PreprocessConfig(ego_box=(4.9, 5.1, 4.9, 5.1, 4.9, 5.1), remove_ground=True)
-    found = keyframe_cloud(Scan(np.concatenate([bad, good]), 0, 0), AT_ONCE, preprocess, CONFIG)
+    found = keyframe_cloud(Scan(np.concatenate([bad, good]), 0, 0), AT_ONCE, preprocess)
     expected = centroids(good, 0.3)
     assert found.dtype == np.float32
     assert len(found) == len(expected)
@@ -50,9 +48,9 @@ def test_a_wall_seen_while_turning_is_straight_again() -> None:
     poses = se3.exp(times[:, None] * np.array([10.0, 0, 0, 0, 0, np.pi / 2]))
     seen = np.einsum("nij,nj->ni", se3.inverse(poses)[:, :3, :3], wall - poses[:, :3, 3]).astype(np.float32)
     scan = Scan(seen, 0, 0, times=times.astype(np.float32))
-    straight = keyframe_cloud(scan, motion, PreprocessConfig(), CONFIG)
+    straight = keyframe_cloud(scan, motion, PreprocessConfig())
     assert np.abs(straight[:, 0] - 10.0).max() < 0.005
-    off = keyframe_cloud(scan, motion, PreprocessConfig(deskew=False), CONFIG)
+    off = keyframe_cloud(scan, motion, PreprocessConfig(deskew=False))
     assert np.abs(off[:, 0] - 10.0).max() > 0.5
 
 

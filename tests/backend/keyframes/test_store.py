@@ -75,32 +75,29 @@ def test_the_same_clouds_make_the_same_bytes(tmp_path: Path) -> None:
     assert len(list((tmp_path / "a").iterdir())) == 4
 
 
-def test_clouds_that_are_not_packed_are_larger_and_the_same(tmp_path: Path) -> None:
+def test_clouds_are_packed_on_disk_and_in_memory(tmp_path: Path) -> None:
     points = np.round(cloud(0) * 512) / 512
-    packed, plain, in_memory = (
-        KeyframeStore(home, cache_size=0, deflate=deflate)
-        for home, deflate in ((tmp_path / "packed", 1), (tmp_path / "plain", 0), (None, 0))
-    )
-    for store in (packed, plain, in_memory):
+    on_disk, in_memory = (KeyframeStore(home, cache_size=0) for home in (tmp_path / "packed", None))
+    for store in (on_disk, in_memory):
         store.add(keyframe(0), points)
         assert np.array_equal(store.points(0), points)
-    assert packed.size < points.nbytes < plain.size == in_memory.size
+    assert on_disk.size == in_memory.size < points.nbytes
 
 
-@pytest.mark.parametrize("packing", [0, 1])
-def test_classes_are_packed_with_their_cloud(tmp_path: Path, packing: int) -> None:
+def test_classes_are_packed_with_their_cloud(tmp_path: Path) -> None:
     points, labels = cloud(3), np.arange(len(cloud(3)), dtype=np.uint16)
-    store = KeyframeStore(tmp_path / "keyframes", cache_size=0, deflate=packing)
+    store = KeyframeStore(tmp_path / "keyframes", cache_size=0)
     store.add(keyframe(0), points, labels)
     np.testing.assert_array_equal(store.points(0), points)
     np.testing.assert_array_equal(np.asarray(store.labels(0)), labels)
 
 
-def test_clouds_of_an_older_version_are_read(tmp_path: Path) -> None:
-    """Their planes are deflated as a member of the archive."""
+@pytest.mark.parametrize("level", [0, 1])
+def test_clouds_of_an_older_version_are_read(tmp_path: Path, level: int) -> None:
+    """Their planes are a member of the archive, stored or deflated."""
     filled(tmp_path, 2).save()
     planes = np.ascontiguousarray(cloud(1).T).view(np.uint8).reshape(3, -1, 4).transpose(2, 0, 1)
-    write_npz(tmp_path / "000001.npz", {"planes": planes}, 1)
+    write_npz(tmp_path / "000001.npz", {"planes": planes}, level)
     np.testing.assert_array_equal(KeyframeStore(tmp_path, cache_size=0).points(1), cloud(1))
 
 

@@ -104,7 +104,7 @@ LAP = 360.0
 
 
 def detect(
-    monkeypatch: pytest.MonkeyPatch, memory: str, bound: int, laps: float, threads: int = 1
+    monkeypatch: pytest.MonkeyPatch, bound: int | None, laps: float, threads: int = 1
 ) -> tuple[list[LoopCandidate], Detector]:
     """Candidates of laps round a thin town, verified where their true poses are near each other."""
     true = np.array([round_the_square(d) for d in np.arange(0, laps * LAP, 5.0)])
@@ -118,7 +118,7 @@ def detect(
         verdict = Verdict.ACCEPTED if away < 5 and b % 7 else Verdict.REJECTED
         return LoopCandidate(match.number, b, away, match.distance, verdict, LoopStage.OVERLAP, "")
 
-    config = LoopsConfig.model_validate({"memory": memory, "memory_places": bound})
+    config = LoopsConfig(memory_places=bound)
     detector = Detector(keyframes_of(true), cloud, config, RegistrationConfig())
     monkeypatch.setattr(detector, "_examine", examine)
     monkeypatch.setattr(detector, "_level_world", lambda: None)
@@ -126,14 +126,14 @@ def detect(
 
 
 def test_laps_are_closed_with_places_in_memory_and_threads_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    alone, detector = detect(monkeypatch, "bounded", 80, 4.2)
-    together, _ = detect(monkeypatch, "bounded", 80, 4.2, threads=4)
+    alone, detector = detect(monkeypatch, 80, 4.2)
+    together, _ = detect(monkeypatch, 80, 4.2, threads=4)
     assert [repr(c) for c in together] == [repr(c) for c in alone]
     closures = [c for c in alone if c.is_accepted]
     assert all(any(lap * 72 < c.b <= (lap + 1) * 72 for c in closures) for lap in (1, 2, 3))
     assert {c.a // 72 for c in closures if c.b > 216} & {1, 2}
     assert len(detector.memory) <= 80 + 2 * LOOP_PLACES + MOST_RETRIEVALS
-    assert sum(c.is_accepted for c in detect(monkeypatch, "all", 80, 4.2)[0]) <= 1.2 * len(closures)
+    assert sum(c.is_accepted for c in detect(monkeypatch, None, 4.2)[0]) <= 1.2 * len(closures)
 
 
 def test_neighbours_that_look_alike_are_rehearsed_as_one_place() -> None:
@@ -142,7 +142,7 @@ def test_neighbours_that_look_alike_are_rehearsed_as_one_place() -> None:
     clouds = [seen(world, pose, np.random.default_rng(k)) for k, pose in enumerate(true)]
 
     def places(rehearsal: float) -> NDArray[np.int64]:
-        config = LoopsConfig.model_validate({"memory": "bounded", "rehearsal": rehearsal})
+        config = LoopsConfig(memory_places=500, rehearsal=rehearsal)
         detector = Detector(keyframes_of(true), clouds.__getitem__, config, RegistrationConfig())
         place_of = detector._rehearse(1 - rehearsal, lambda: False)
         assert set(np.diff(place_of)) <= {0, 1}

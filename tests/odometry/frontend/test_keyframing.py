@@ -82,7 +82,7 @@ def test_distorted_scans_become_straight_clouds_of_every_method(method: str, sha
         step = se3.log(se3.relative(poses[keyframe.scan], poses[keyframe.scan + 1]))
         scan = drive.scan(keyframe.scan)
         truth = MotionPrior(0.1 * knots, se3.exp(knots[:, None] * step))
-        whole, crooked = (keyframe_cloud(scan, m, config.preprocess, config.keyframes) for m in (truth, AT_ONCE))
+        whole, crooked = (keyframe_cloud(scan, m, config.preprocess) for m in (truth, AT_ONCE))
         error, before = (mean_distance(cloud, whole) for cloud in (store.points(keyframe.number), crooked))
         assert error < share * before, f"keyframe {keyframe.number}: {error:.3f} m, not deskewed {before:.3f} m"
 
