@@ -38,8 +38,8 @@ def with_drift(results: Sequence[ScanResult], config: DebugConfig, tilt_deg_per_
     poses = np.stack([r.T_world_lidar for r in results])
     steps = se3.relative(poses[:-1], poses[1:])
     way = np.linalg.norm(steps[:, :3, 3], axis=1)
-    if config.drift_recorded is not None:
-        errors = errors_over(way, *recorded_errors(*config.drift_recorded))
+    if config.drift_recording is not None:
+        errors = errors_over(way, *recorded_errors(*config.drift_recording))
         astray = [poses[0]]
         for step, error in zip(steps, errors, strict=True):
             astray.append(se3.normalise(astray[-1] @ step @ error))
@@ -119,8 +119,8 @@ def moved_keyframes(keyframes: Sequence[Keyframe], results: Sequence[ScanResult]
 
 def describe(config: DebugConfig) -> str:
     """Sentence about the added drift, for the manifest and the log."""
-    if config.drift_recorded is not None:
-        estimate, truth = config.drift_recorded
+    if config.drift_recording is not None:
+        estimate, truth = config.drift_recording
         return f"debug.drift: odometry was made to err as {estimate} does against {truth}; this run is an experiment"
     lasting = "steadily" if config.drift_memory is None else f"anew after some {config.drift_memory:g} m"
     if config.drift_kind == "random-walk":

@@ -89,7 +89,7 @@ def test_recorded_errors_are_those_of_the_run_laid_on_another(is_camera: bool, t
     for name, poses in (("estimate", found), ("truth", real)):
         write_tum(tmp_path / f"{name}.tum", Trajectory(stamps, C @ np.stack(poses) @ se3.inverse(C)))
     config = DebugConfig(
-        drift_kind="recorded", drift_recorded=(str(tmp_path / "estimate.tum"), str(tmp_path / "truth.tum"))
+        drift_kind="recorded", drift_recording=(str(tmp_path / "estimate.tum"), str(tmp_path / "truth.tum"))
     )
     results = [ScanResult(i, i * 100_000_000, T) for i, T in enumerate(real)]
     drifted = np.stack([r.T_world_lidar for r in with_drift(results, config)])
@@ -108,7 +108,7 @@ def test_recorded_errors_are_those_of_the_run_laid_on_another(is_camera: bool, t
 def test_recorded_errors_need_a_run_that_moved(tmp_path: Path) -> None:
     for name in ("estimate", "truth"):
         write_tum(tmp_path / f"{name}.tum", Trajectory(np.arange(9) * 10**8, np.tile(np.eye(4), (9, 1, 1))))
-    files = {"drift_recorded": [str(tmp_path / f"{name}.tum") for name in ("estimate", "truth")]}
+    files = {"drift_recording": [str(tmp_path / f"{name}.tum") for name in ("estimate", "truth")]}
     with pytest.raises(InputError, match=r"truth\.tum does not move"):
         with_drift(RESULTS, DebugConfig.model_validate({"drift_kind": "recorded", **files}))
     for wrong in ({"drift_kind": "recorded"}, files, {"drift_kind": "random-walk", "drift_memory": 20.0}):

@@ -297,7 +297,7 @@ class DebugConfig(Section):
     drift_memory: float | None = Field(
         None, gt=0, description="m; way over which both are forgotten and drawn anew; absent: they never change"
     )
-    drift_recorded: tuple[str, str] | None = Field(
+    drift_recording: tuple[str, str] | None = Field(
         None,
         description="`recorded`: trajectory of that run and its ground truth, in any format that `eval` reads; where they end "
         "its errors begin anew",
@@ -306,10 +306,10 @@ class DebugConfig(Section):
     @model_validator(mode="after")
     def _check(self) -> Self:
         """Raise ValueError for keys that do not belong to the kind of drift."""
-        if self.drift_kind == "recorded" and not self.drift_recorded:
-            raise ValueError("drift_kind = recorded takes drift_recorded, the estimate and the truth of a real run")
-        if self.drift_kind != "recorded" and self.drift_recorded:
-            raise ValueError(f"drift_recorded is of drift_kind = recorded, not of {self.drift_kind}")
+        if self.drift_kind == "recorded" and not self.drift_recording:
+            raise ValueError("drift_kind = recorded takes drift_recording, the estimate and the truth of a real run")
+        if self.drift_kind != "recorded" and self.drift_recording:
+            raise ValueError(f"drift_recording is of drift_kind = recorded, not of {self.drift_kind}")
         if self.drift_kind != "rate" and self.drift_memory is not None:
             raise ValueError(f"drift_memory is of drift_kind = rate, not of {self.drift_kind}")
         return self

@@ -89,7 +89,7 @@ def test_wrong_values_name_the_key_and_the_way_out(setting: str, words: str) -> 
         ("graph.incremental=true", r'graph\.optimizer = "isam2"'),
         ("graph.gravity=false", r"graph\.gravity_deg = 0"),
         ("graph.imu_orientation=true", r"graph\.imu_orientation_deg"),
-        ("debug.drift_estimate=run.tum", r"first of debug\.drift_recorded"),
+        ("debug.drift_estimate=run.tum", r"first of debug\.drift_recording"),
     ],
 )
 def test_a_key_of_an_earlier_version_is_answered_with_what_became_of_it(setting: str, words: str) -> None:
