@@ -39,7 +39,7 @@ class SharedOdometry:
         key = _key(sequence, keyframing)
         if key not in self._held:
             results = estimate(sequence, *given, keyframing=keyframing, monitor=monitor, **more)
-            keyframing.settle()
+            keyframing.finalise()
             store = keyframing.store
             clouds = [(store.points(k.number), store.labels(k.number)) for k in store.keyframes]
             self._held[key] = list(results), list(store.keyframes), clouds, list(monitor.checks)
@@ -48,7 +48,7 @@ class SharedOdometry:
         monitor.checks.extend(checks)
         for keyframe, cloud in zip(keyframes, clouds, strict=True):
             keyframing.store.add(keyframe, *cloud)
-        keyframing.settle()
+        keyframing.finalise()
         for result in results:
             more["on_scan"](result)
         return list(results)

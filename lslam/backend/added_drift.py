@@ -61,7 +61,10 @@ def with_drift(results: Sequence[ScanResult], config: DebugConfig, tilt_deg_per_
 
 
 def _courses(way: Floats, config: DebugConfig) -> tuple[Floats, Floats]:
-    """Direction (N, 3) of the position drift and sign (N,) of the heading drift for steps of `way` (N,) m, of unit size (rms)."""
+    """Direction (N, 3) of the position drift and sign (N,) of the heading drift of each step, random, of unit size (rms).
+
+    way : (N,) m, length of the steps
+    """
     rng = np.random.default_rng(config.drift_seed)
     direction = rng.normal(size=3)
     direction /= np.linalg.norm(direction)
@@ -133,7 +136,7 @@ def describe(config: DebugConfig) -> str:
 
 
 def _move(results: Sequence[ScanResult], poses: Floats) -> list[ScanResult]:
-    """The results at `poses` (N, 4, 4), with their covariances rotated likewise."""
+    """The results at other `poses` (N, 4, 4), their covariances rotated with the poses."""
     turns = so3.normalise(poses[:, :3, :3] @ np.stack([r.T_world_lidar[:3, :3].T for r in results]))
 
     def rotate(covariance: Floats | None, R: Floats) -> Floats | None:

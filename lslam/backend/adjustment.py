@@ -86,7 +86,10 @@ class SweptPoints:
         return cls(*(np.concatenate([getattr(part, name) for part in own]) for name in ("points", "poses", "shares")))
 
     def on_knots(self, knots: Longs) -> SweptPoints:
-        """The same points between the poses of numbers `knots` (M,) alone, the first and the last of all among them."""
+        """The points referred to the poses with numbers `knots` (M,) alone: `poses` and `shares` count between these.
+
+        The first and the last pose must be knots.
+        """
         places = plane_adjustment.place_between(self.poses + self.shares, knots.astype(np.float64))
         return SweptPoints(self.points, *places)
 

@@ -110,7 +110,7 @@ def describe_clock(offset: ClockOffset) -> str:
 def with_actual_sigmas(
     fixes: Fixes, level: Floats, largest: float, probability: float, faults: Faults
 ) -> tuple[Fixes, Faults]:
-    """The fixes with the sigmas of their scatter where they state significantly less, and the faults with a sentence on it.
+    """The fixes with larger sigmas where they scatter by significantly more than stated, and the faults with a sentence on that.
 
     Sigmas are left as stated where the scatter would make them larger than `largest`, m: those are no fixes.
     level : (3, 3) rotation that makes the trajectory level; probability : of the test for significance

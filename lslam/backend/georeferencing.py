@@ -167,7 +167,10 @@ def on_earth(graph: PoseGraph, placement: Placement) -> PoseGraph:
 
 
 def final_fixes(sequence: Sequence, results: Many[ScanResult], config: Config) -> Fixes | None:
-    """The fixes of a recording beside its final poses, whether they were used or not; None where too few are usable."""
+    """The usable fixes of a recording with the antenna at its final poses, whether the run used them or not.
+
+    None where too few are usable.
+    """
     assert sequence.gnss is not None
     fixes = _usable(sequence.gnss, results, _antenna(sequence), config.gnss, config.graph)
     return None if isinstance(fixes, str) else fixes

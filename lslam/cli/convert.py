@@ -236,7 +236,7 @@ def _convert_trajectory(source: str, kind: str, out: Path, given: dict[str, Any]
 
 
 def _projection(source: Path, given: dict[str, Any]) -> Projection | None:
-    """Coordinates of the map of a georeferenced run, or those that are asked for; None of a trajectory that lies nowhere."""
+    """Projection to the coordinates of the run's map, or of the options; None for a trajectory without a georeference."""
     from lslam.maps.georeference import Projection, in_crs
     from lslam.pipeline.convert.convert_trajectory import find_georeference, georeference_beside
 

@@ -55,7 +55,7 @@ def flag(*words: str, **more: Any) -> Callable[[F], F]:
 
 
 def group(*options: Callable[[F], F]) -> Callable[[F], F]:
-    """Options in the order in which `--help` lists them."""
+    """Decorator of several options, listed by `--help` in this order."""
 
     def add(function: F) -> F:
         for one in reversed(options):

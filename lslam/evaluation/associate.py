@@ -171,7 +171,7 @@ def _no_overlap(estimate: Trajectory, stamps: Stamps, truth: Trajectory, count: 
 
 
 def estimate_offset(estimate: Trajectory, truth: Trajectory) -> tuple[int, float]:
-    """Shift in ns to add to the estimate's stamps, and the correlation (0..1) that speaks for it.
+    """Shift, ns, to add to the estimate's stamps, and the correlation at that shift, 0..1.
 
     Speed and rotation rate, which no frame changes, are correlated over all shifts in which at least 60 % of the shorter
     trajectory overlaps; the best one is refined between samples. When the stamps then agree up to one constant to 1 ms,

@@ -112,7 +112,7 @@ def main_axis(poses: Floats) -> str | None:
 
 
 def _is_camera(poses: Floats, frame: str) -> bool | None:
-    """True for camera poses, False for LiDAR poses, None when neither motion nor file says."""
+    """True for camera poses, False for LiDAR poses, by the motion or the `frame` of the file; None when neither is clear."""
     axis = main_axis(poses)
     if axis in ("+z", "-z") and frame != "lidar":
         return True

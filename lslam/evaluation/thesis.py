@@ -290,10 +290,10 @@ def median_and_worst(values: Sequence[float]) -> tuple[float, float]:
 
 
 def difficulty(pairs: Sequence[tuple[float | None, Sequence[float]]]) -> str:
-    """How hard ours was beside theirs: `as hard`, `easier`, `harder` or `partly as hard`; empty where nobody knows.
+    """How hard our drives were beside those of the thesis: `as hard`, `easier`, `harder` or `partly as hard`.
 
-    A measure is as hard if the median of ours is that printed, up to the factor `LIKE` either way.
-    pairs : of each measure of it, the printed number and those of our runs; all must say the same
+    Empty where it is unknown. A measure is as hard if the median of our runs is that printed, up to the factor `LIKE`.
+    pairs : for each measure, the printed number and those of our runs; all must agree
 
     >>> difficulty([(2.0, [0.1, 0.2])]), difficulty([(2.0, [1.5]), (9.0, [8.0])]), difficulty([(None, [1.0])])
     ('easier', 'as hard', '')

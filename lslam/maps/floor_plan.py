@@ -100,7 +100,7 @@ class TopView:
 
 
 def pixel_size(voxel: float, least: float = 0.2) -> float:
-    """Edge of pixels that hold whole columns of voxels of edge `voxel`, m, and are not under `least`; `least` without voxels.
+    """Edge of a pixel, m, at least `least`, that is a multiple of the voxels' edge `voxel`, m; `least` without voxels.
 
     >>> round(pixel_size(0.15), 9)
     0.3

@@ -92,7 +92,7 @@ class ListedMethod:
 
 
 def coupling_of(method: str) -> Coupling:
-    """What the method does with an IMU; those of other packages are predicted by it."""
+    """How the method uses an IMU; for methods of other packages it predicts."""
     from lslam.core.config.odometry import TIGHTLY_COUPLED
 
     if method in TIGHTLY_COUPLED:
@@ -116,9 +116,9 @@ def require_method(name: str) -> None:
 
 
 def create_odometry(config: Config) -> Odometry:
-    """The method `odometry.method` names.
+    """Create the method that `odometry.method` names.
 
-    Raises UsageError with the nearest name when there is none, and when another package's lacks what methods declare.
+    Raises UsageError with the nearest name for an unknown method, and for one of another package that lacks `Traits`.
     """
     from lslam.odometry.base import Traits
 

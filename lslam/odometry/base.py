@@ -59,7 +59,7 @@ class FeatureSource(Traits, Protocol):
     """A method that sees features, of which a map can be made."""
 
     def features_of(self, prepared: Any, motion: MotionPrior) -> Features:
-        """What `prepare` made of a scan, as seen from the pose at the stamp when the sensor moved as `motion` says."""
+        """The features of a prepared scan, deskewed to the pose at the stamp by `motion`."""
         ...
 
 
@@ -95,14 +95,14 @@ class WindowMethod(Deskewing, Protocol):
     """A method whose scans stay open while a motion model estimates their poses together."""
 
     def equations(self, stamp_ns: int, result: RegistrationResult) -> tuple[ScanEquations, ...]:
-        """What the points of a scan say of its pose where `register` found it; nothing where that failed."""
+        """Normal equations of a scan's points about the pose of its registration; empty where that failed."""
         ...
 
     def equations_at(self, poses: Mapping[int, Floats]) -> tuple[ScanEquations, ...]:
-        """Likewise of scans at other poses (4, 4), by their stamps; nothing of those that are no longer open."""
+        """Normal equations of scans at other poses (4, 4), by their stamps; scans that are no longer open have none."""
         ...
 
-    def settle(self, poses: Mapping[int, Floats]) -> None:
+    def finalise(self, poses: Mapping[int, Floats]) -> None:
         """Learn the poses (4, 4) of the scans that are estimated together, by their stamps; all others are closed."""
         ...
 
@@ -163,7 +163,7 @@ class MapMethod(Traits, Stateful):
         return self._uncertainty.map_age
 
     def update(self, scan: Scan, prior: MotionPrior, result: RegistrationResult) -> ScanResult:
-        """Enter the scan into the map where its result puts it."""
+        """Enter the scan into the map at the pose of its result. Returns its record with covariances."""
         began = time.perf_counter()
         result = self.insert(scan.stamp_ns, prior, result)
         record = to_scan_result(scan, result, *self._uncertainty.covariances(result, scan.stamp_ns, prior))

@@ -32,7 +32,7 @@ LAG_RATIO = math.sqrt(10.0) / 6.0
 
 
 def create(config: Config) -> CtIcp:
-    """The method as the configuration wants it: point to plane, on the local map of `icp`."""
+    """Create the method from the configuration: point to plane, on the local map of `icp`."""
     return CtIcp(registration_of(config))
 
 

@@ -17,7 +17,7 @@ from lslam.registration.result import RegistrationResult
 
 
 def create(config: Config) -> Dlo:
-    """The method as the configuration wants it, with no recovery beside the two registrations."""
+    """Create the method from the configuration; its only recovery is the second registration."""
     return Dlo(registration_of(config, "gicp", NO_RECOVERY, target="submap"))
 
 

@@ -212,8 +212,8 @@ def register_elastic(
         H, g, facts = points.linearise(prior, (scale, annealing.end, np.inf))
         if facts[at.MATCHED] < d.shape[1]:
             break
-        H, g = _about_own_place(H, g, sweep, shares, prior.pose[:3, 3])
-        A, b = _of_ends_and_skew(H, g, shares)
+        H, g = _about_sensor(H, g, sweep, shares, prior.pose[:3, 3])
+        A, b = _to_ends_and_skew(H, g, shares)
         lever = np.sqrt(max(facts[at.LEVER] / max(facts[at.INFORMATION], 1e-300), 1e-6))
         weak = _weak(H.sum(0), lever, weak_share * facts[at.INFORMATION])
         constraints.add_to(A, b, sweep)
@@ -243,9 +243,7 @@ def register_elastic(
     return ElasticResult(sweep, skew[0], covariance, result)
 
 
-def _about_own_place(
-    H: Floats, g: Floats, sweep: ElasticSweep, shares: Floats, centre: Floats
-) -> tuple[Floats, Floats]:
+def _about_sensor(H: Floats, g: Floats, sweep: ElasticSweep, shares: Floats, centre: Floats) -> tuple[Floats, Floats]:
     """Equations H (K, 6, 6), g (K, 6) of the parts of a sweep, with rotations about the sensor's position in each part.
 
     The given ones rotate about `centre` (3,); shares : (K,) of the sweep that is over when a part was measured.
@@ -257,7 +255,7 @@ def _about_own_place(
     return transposed @ H @ G, (transposed @ g[..., None])[..., 0]
 
 
-def _of_ends_and_skew(H: Floats, g: Floats, shares: Floats) -> tuple[Floats, Floats]:
+def _to_ends_and_skew(H: Floats, g: Floats, shares: Floats) -> tuple[Floats, Floats]:
     """(18, 18), (18,) of begin, end and the map's skew: `1 - share` of the first, `share` of the second move a part.
 
     A map made of sweeps that lack the motion `skew` from begin to end shows a part too near by `share - 1/2` of it.

@@ -19,7 +19,7 @@ from lslam.odometry.loam import VARIANTS, Loam
 
 
 def create(config: Config) -> FastLio | FastLio2:
-    """The method that `odometry.method` names, with no recovery beside the filter but `at_rest`."""
+    """Create the method that `odometry.method` names; its only recovery policy is `at_rest`."""
     recovery = rest_alone(config.recovery)
     if config.odometry.method == "fast-lio":
         return FastLio(config.model_copy(update={"recovery": recovery}), VARIANTS["floam"])

@@ -84,7 +84,7 @@ def no_counterparts(count: int) -> Matches:
 
 
 def surface_size(size: float, grid_step: float) -> float:
-    """Edge of voxels, m, of `size` or as large as points of a grid of `grid_step`, m, need: a plane takes six of them."""
+    """Edge, m, of voxels of planar points: `size`, or larger, so that a voxel holds six points of a grid of `grid_step`, m."""
     return max(size, 1.5 * grid_step)
 
 
@@ -94,7 +94,7 @@ def feature_scan(features: Features, T_world_lidar: Floats, grid_step: float = 0
 
 
 def to_arrays(features: Features) -> Features:
-    """The features as plain arrays, which checkpoints can hold: no part of them waits to be deskewed."""
+    """The features with all points computed as arrays, for checkpoints."""
     return features.each(lambda part: FeaturePoints(part.points, part.rings, part.times))
 
 

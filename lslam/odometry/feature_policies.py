@@ -141,7 +141,10 @@ class AllPointsInstead:
     """`icp` on all points of the scan, where they contradict the features or constrain a poorly constrained pose."""
 
     def recover(self, attempt: Attempt, result: RegistrationResult) -> RegistrationResult:
-        """Register all points at the start, far from the prior or if poorly constrained; that result, if other, replaces it."""
+        """Replace the result by `icp` on all points where these contradict the features, or where the features constrain little.
+
+        The first is tested at the start and far from the prior.
+        """
         points, c = attempt.target.all_points, attempt.config
         if points is None:
             return result

@@ -99,7 +99,10 @@ class GivenPoses(Traits, Stateful):
 
 
 def create(config: Config) -> GivenPoses:
-    """The poses of `odometry.poses`. Raises UsageError without a file, InputError for one that cannot be read."""
+    """Create the method with the poses of `odometry.poses`.
+
+    Raises UsageError without a file, InputError for one that cannot be read.
+    """
     if not config.odometry.poses:
         raise UsageError("method poses needs a trajectory: name its file with --poses")
     path = Path(config.odometry.poses)

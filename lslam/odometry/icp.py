@@ -25,7 +25,7 @@ from lslam.registration.voxel_target import MIN_SOURCE_POINTS
 
 
 def create(config: Config) -> Icp:
-    """The method `icp` with the configured residual, or one named after its residual, with or without the prefix `icp-`.
+    """Create `icp` with the configured residual, or the method named after its residual, with or without the prefix `icp-`.
 
     Raises UsageError when `registration.residual` is another one.
     """

@@ -45,7 +45,7 @@ class Partners:
 
 
 def create(config: Config) -> IcpSvd:
-    """The method as the configuration wants it."""
+    """Create the method from the configuration."""
     return IcpSvd(config.preprocess, config.registration)
 
 
@@ -105,11 +105,12 @@ def align_closed_form(
     inlier_distance: float | None = None,
     max_iterations: int = 50,
 ) -> RegistrationResult:
-    """Pose of the source points (S, 3), m, LiDAR frame, by equations 2.17 to 2.20 of Girolimetto.
+    """Pose of the source points (S, 3), m, LiDAR frame, by equations 2.17 to 2.20 of Girolimetto, from `T_prior` (4, 4).
 
     Each round pairs every point with its nearest in the last scan, keeps the pairs within `inlier_distance`, m (None: the
     inliers of the X84 rule), of these the closest `inlier_ratio`, and computes the least-squares transform:
-    centroids removed (2.18, 2.19), rotation by SVD of the covariance (2.20). Not converged where the pairs do not determine it.
+    centroids removed (2.18, 2.19), rotation by SVD of the covariance (2.20). Where the pairs do not determine it, the result is
+    the prior, not converged.
     """
     T = se3.relative(last.T_world_lidar, T_prior)
     converged, rounds, near = False, 0, np.zeros(0, np.int64)

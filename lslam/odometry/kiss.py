@@ -21,8 +21,9 @@ from lslam.registration.voxel_target import MIN_SOURCE_POINTS
 
 
 def create(config: Config) -> Kiss:
-    """The baseline with kiss-icp's defaults; of `preprocess` it follows the farthest range when the user changed it, and
-    what takes points out: the ego box, `remove_ground`, `denoise`.
+    """Create the baseline with kiss-icp's defaults.
+
+    Of `preprocess` it follows the farthest range if the user changed it, the ego box, `remove_ground` and `denoise`.
     """
     return Kiss(config.preprocess, has_user_range="range_max" in config.preprocess.model_fields_set)
 

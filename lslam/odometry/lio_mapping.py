@@ -20,7 +20,7 @@ from lslam.registration.result import RegistrationResult
 
 
 def create(config: Config) -> LioMapping:
-    """The method as the configuration wants it: point to plane, with no recovery beside the window."""
+    """Create the method from the configuration: point to plane, without recovery policies."""
     return LioMapping(registration_of(config, recovery=rest_alone(config.recovery)), WINDOW_SCANS - 1)
 
 
@@ -78,7 +78,7 @@ class LioMapping(FastLio2):
         self.pending = (*self.pending, (stamp_ns, result.points, result.T_world_lidar, result.is_stationary))
         return result
 
-    def settle(self, poses: Mapping[int, Floats]) -> None:
+    def finalise(self, poses: Mapping[int, Floats]) -> None:
         """Set the queued scans to the window's poses (4, 4), by stamp; those old enough, or no longer in it, enter the map."""
         waiting = [(stamp_ns, points, poses.get(stamp_ns, T), rests) for stamp_ns, points, T, rests in self.pending]
         due = [k < len(waiting) - self.lag or one[0] not in poses for k, one in enumerate(waiting)]

@@ -28,7 +28,7 @@ KEYFRAMES, KEYFRAME_M, KEYFRAME_DEG = 25, 1.0, 10.0
 
 
 def create(config: Config) -> LioSam | LioSamOfPoints:
-    """The method on LOAM features or on all points; its only recovery policy is `at_rest`."""
+    """Create the method on LOAM features or on all points; its only recovery policy is `at_rest`."""
     if config.lio_sam.features == "loam":
         keyframes = KEYFRAMES, KEYFRAME_M, float(np.deg2rad(KEYFRAME_DEG))
         quiet = config.model_copy(update={"recovery": rest_alone(config.recovery)})

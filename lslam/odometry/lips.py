@@ -180,7 +180,7 @@ def _coast(e: ImuEstimate, motion: Floats, seconds: float) -> PreintegratedStep:
 
 
 def create(config: Config) -> Lips:
-    """The method as the configuration wants it."""
+    """Create the method from the configuration."""
     return Lips(config)
 
 

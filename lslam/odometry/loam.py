@@ -31,7 +31,7 @@ VARIANTS = {
 
 
 def create(config: Config) -> Loam:
-    """The variant that `odometry.method` names."""
+    """Create the variant that `odometry.method` names."""
     method = config.odometry.method
     return (LegoLoam if method == "lego-loam" else Loam)(config, VARIANTS[method])
 

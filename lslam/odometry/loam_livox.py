@@ -27,7 +27,7 @@ LIVOX = LoamVariant(None, with_map=True, with_less_planes=True, inlier_ratio=INL
 
 
 def create(config: Config) -> LoamLivox:
-    """The method as the configuration wants it."""
+    """Create the method from the configuration."""
     return LoamLivox(config, LIVOX)
 
 

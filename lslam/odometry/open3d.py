@@ -35,7 +35,7 @@ class Reference:
 
 
 def create(config: Config) -> Open3dGicp:
-    """The baseline; the range gate follows `preprocess`."""
+    """Create the baseline; its range gate follows `preprocess`."""
     return Open3dGicp(config.preprocess, config.registration)
 
 

@@ -28,7 +28,7 @@ STEP_M, STEP_DEG = 2.0, 15.0
 
 
 def create(config: Config) -> SmallGicp:
-    """The baseline; the range gate follows `preprocess`, the number of threads `input.threads`."""
+    """Create the baseline; its range gate follows `preprocess`, its number of threads `input.threads`."""
     return SmallGicp(config.preprocess, config.registration, config.input.workers)
 
 

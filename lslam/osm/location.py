@@ -192,7 +192,7 @@ def _along(
         with clocks[number].stage("map match"):
             match = _gate(match_keyframe(view, osm, config.osm), track, config.osm, config.graph)
         if match.is_accepted:
-            track.take(match.pose, match.information)
+            track.correct(match.pose, match.information)
         matches.append(match)
     return matches
 

@@ -177,7 +177,7 @@ def _bounds_of(path: Path) -> Bounds | None:
 
 
 def _ask_patiently(bounds: Bounds, config: OsmConfig, folder: Path, sleep: Callable[[float], None]) -> OverpassReply:
-    """The reply to `bounds`, asked `config.attempts` times with growing pauses (s); raises InputError after the last one."""
+    """Request the buildings in `bounds`, `config.attempts` times at most with growing pauses (s); then InputError."""
     wait = BACKOFF_S
     # All threads and processes of this user together send one request at a time.
     with _one_thread_at_a_time, one_at_a_time(folder / "request.lock", "asks the map server"):
@@ -198,7 +198,7 @@ def _ask_patiently(bounds: Bounds, config: OsmConfig, folder: Path, sleep: Calla
 
 
 def _ask(bounds: Bounds, config: OsmConfig) -> OverpassReply:
-    """One request. Raises _TryAgainError when another attempt may succeed, InputError when it cannot.
+    """Send one request. Raises _TryAgainError when another attempt may succeed, InputError when it cannot.
 
     It runs in a thread of its own, because looking up a name and receiving headers have no timeout: all of it together takes
     `config.timeout` at most.

@@ -48,7 +48,7 @@ class OsmTrack:
         self.pose = moved
 
     def begin(self, pose: Floats, information: Floats) -> None:
-        """Reset the track to the pose (3,) and information (3, 3) of a match of full rank."""
+        """Reset the track to the pose (3,) and information (3, 3) of a match of full rank, and add the map's local error."""
         self.pose = np.asarray(pose, np.float64)
         self.covariance = np.asarray(np.linalg.inv(information) + np.diag(self._map))
 
@@ -58,7 +58,7 @@ class OsmTrack:
         S = H @ self.covariance @ H.T + R
         return float(error @ np.linalg.solve(S, error)), len(error)
 
-    def take(self, pose: Floats, information: Floats) -> None:
+    def correct(self, pose: Floats, information: Floats) -> None:
         """Kalman update with a matched pose (3,), map frame, and its information (3, 3), which may be singular."""
         error, H, R = self._innovation(pose, information)
         gain = np.linalg.solve(H @ self.covariance @ H.T + R, H @ self.covariance).T

@@ -79,7 +79,7 @@ def find_walls(
     views: NDArray[Any] | None = None,
     is_wall: Bools | None = None,
 ) -> Walls:
-    """Walls in the points (N, 3), m, of a scan or of a submap, in a frame whose z points up.
+    """Extract walls from the points (N, 3), m, of a scan or of a submap, in a frame whose z points up.
 
     is_wall : (N,) points that may be of walls; the others serve to find the ground
     views : (V, 2) or (V, 3) positions of the sensor, m, which direct the walls; the origin by default

@@ -120,7 +120,7 @@ def prepare(
 
 
 def is_open(config: Config, key: str) -> bool:
-    """Whether the scene decides on `section.key`: nobody has set it."""
+    """Whether `section.key` is not set by the user, so that the scene decides on it."""
     section, _, name = key.partition(".")
     return key in OPEN_KEYS and name not in getattr(config, section).model_fields_set
 
@@ -210,7 +210,7 @@ def _set_by_hand(config: Config) -> list[str]:
 
 @contextmanager
 def stoppable(job: PreparedRun, message: str) -> Iterator[None]:
-    """What is asked to stop in the block ends it, and the run is interrupted with the `message`."""
+    """Context in which a requested stop ends the block, and the manifest notes the interruption with `message`."""
     try:
         with asking(job.watch.should_stop, message):
             yield

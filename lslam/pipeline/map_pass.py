@@ -128,7 +128,7 @@ def posed_scans(
     count: int = 0,
     offer: Offer | None = None,
 ) -> Iterator[tuple[int, PosedScan | None]]:
-    """As `scans_again`, of all scans by default: each deskewed and at its pose; None for one that is not registered."""
+    """As `scans_again`, by default of all scans, each deskewed and at its pose; None in place of an unregistered scan."""
     numbers = range(len(results)) if numbers is None else numbers
     for k, loaded in scans_again(sequence, scan_poser(results, config), numbers, config, watch, message, count, offer):
         yield k, loaded.prepared

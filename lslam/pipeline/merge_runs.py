@@ -14,7 +14,7 @@ from lslam.backend.graph.odometry_constraints import correct_scans
 from lslam.backend.graph.pose_graph import optimise
 from lslam.backend.graph.problem import PoseGraph, Solution
 from lslam.backend.keyframes.store import KeyframeStore
-from lslam.backend.localization.sessions import Chain, Session, tie
+from lslam.backend.localization.sessions import Chain, Session, locate_session
 from lslam.backend.loops.detector import Detector
 from lslam.backend.loops.find_loops import warm_up
 from lslam.backend.outcome import apply_verdicts
@@ -181,7 +181,7 @@ def _connect(sessions: list[Session], config: Config, should_stop: Stop) -> tupl
     while waiting:
         left = []
         for session in waiting:
-            placed, reason = tie(session, tied, config, should_stop)
+            placed, reason = locate_session(session, tied, config, should_stop)
             if should_stop():
                 raise InterruptedRunError(f"interrupted while {session.name} was searched among the other runs")
             if placed is None:

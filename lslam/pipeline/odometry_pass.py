@@ -102,7 +102,7 @@ def estimate_poses(job: PreparedRun) -> RunRecord:
             noise_m=config.registration.sigma,
             beyond_m=surroundings_m(config.registration),
         )
-        keyframing.settle()
+        keyframing.finalise()
     if checkpoints is not None and checkpoints.resumed_after:
         manifest.resumed_after_scans = checkpoints.resumed_after
         manifest.timings["odometry_s"] += checkpoints.seconds

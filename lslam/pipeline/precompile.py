@@ -89,7 +89,7 @@ class HasKernels(Protocol):
     """Object with kernels of its own."""
 
     def warm_up(self) -> None:
-        """Compile or load them."""
+        """Compile or load the object's kernels."""
         ...
 
 

@@ -86,10 +86,12 @@ def refine(
     keyframes: Longs = NO_NUMBERS,
     prior_map: Floats | None = None,
 ) -> tuple[dict[str, Any], list[list[ScanResult]] | None]:
-    """What a manifest says of it, and the results of all drives with refined poses; None where planes do not get thinner.
+    """Refine the poses of all drives together by plane adjustment.
 
-    prior : what is known of the `keyframes`, numbers of scans of the one drive
+    prior : information about the poses of `keyframes`, numbers of scans, of a single drive
     prior_map : (M, 3) m, points of a map that stays, in the world of the poses
+
+    Returns facts for the manifest, and the results of all drives with refined poses; None where planes do not get thinner.
     Raises InterruptedRunError when `watch` says so.
     """
     nodes = [drive.nodes for drive in drives]

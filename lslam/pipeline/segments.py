@@ -10,7 +10,7 @@ from itertools import groupby
 import numpy as np
 
 from lslam.backend.keyframes.store import KeyframeStore, PartOfStore
-from lslam.backend.localization.sessions import Chain, Session, Vicinity, tie
+from lslam.backend.localization.sessions import Chain, Session, Vicinity, locate_session
 from lslam.backend.loops.detector import LEAST_REACH
 from lslam.backend.loops.verify import is_elsewhere
 from lslam.core.arrays import Floats, Longs
@@ -114,7 +114,7 @@ def _placement(
     If no second keyframe of it agrees, the last keyframes before it must.
     """
     near = _vicinity(others[-1], session)
-    placed, reason = tie(session, others, config, should_stop, near)
+    placed, reason = locate_session(session, others, config, should_stop, near)
     if placed is None or placed.start is None:
         return None, reason
     start = placed.start
@@ -129,14 +129,14 @@ def _placement(
 def _is_found_from_before(
     session: Session, before: Session, reach: float, config: Config, should_stop: Callable[[], bool]
 ) -> bool:
-    """Whether the last keyframes before a placed session are also found there, with most of what they observe.
+    """Whether the last keyframes `before` a placed session are located in its map, too, near where the placement puts them.
 
-    reach : search radius, m, around the poses that follow from the placement
+    They must also have the majority of votes. reach : search radius, m
     """
     last = PartOfStore(before.store, range(len(before.keyframes))[-config.keyframes.submap_size :])
     own = last.keyframes[0]
     place = before.T_town_session @ own.T_world_lidar
-    back, _ = tie(
+    back, _ = locate_session(
         replace(before, store=last, keyframes=last.keyframes),
         [session],
         config,

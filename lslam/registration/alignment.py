@@ -44,7 +44,7 @@ def solve(
     residual: ResidualKind = PLANE,
     directions: Floats = EVERYWHERE,
 ) -> RegistrationResult:
-    """Align the source points with maps by annealed Gauss-Newton, starting at `T_prior` (4, 4), as `c` weighs them.
+    """Align the source points with maps by annealed Gauss-Newton, starting at `T_prior` (4, 4); c : noise and limits.
 
     Points without a match in one of the maps, the finest first, are matched in the next. `directions` as in `Limits`.
     """

@@ -42,7 +42,7 @@ class Target(Stateful, ABC):
 
     @abstractmethod
     def count(self, points: Any) -> int:
-        """How many of the points, or features, are matched."""
+        """Number of points or features that registration uses."""
 
     @abstractmethod
     def refusal(self, points: Any) -> str:

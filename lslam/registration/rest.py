@@ -45,7 +45,7 @@ class RestDetector(Stateful):
         self._stayed = self._last_stay = 0
 
     def judge(self, result: RegistrationResult) -> RegistrationResult:
-        """The result, whose `is_stationary` says whether the sensor is at rest; a failed one is returned unchanged."""
+        """The result with `is_stationary` set if the sensor is at rest; updates the reference. Failed results are ignored."""
         if not result.ok:
             return result
         if self._is_near(result):

@@ -105,7 +105,7 @@ class RegistrationResult:
         return self.ok and not self.is_rejected
 
     def with_pose(self, T_world_lidar: Floats, covariance: Floats | None) -> RegistrationResult:
-        """The same registration at another pose."""
+        """The result with another pose (4, 4) and covariance."""
         return replace(self, T_world_lidar=T_world_lidar, covariance=covariance)
 
     def reject(self, reason: str, T_world_lidar: Floats, covariance: Floats | None) -> RegistrationResult:

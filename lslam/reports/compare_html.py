@@ -196,7 +196,7 @@ def trajectory_figure(drawing: Drawing, methods: Sequence[str]) -> Figure:
 
 
 def error_figure(drawing: Drawing, methods: Sequence[str]) -> Figure | None:
-    """Position error over distance, one line per method; without ground truth the distance from the first of them."""
+    """Position error over distance, one line per method; without ground truth the distance from the reference method."""
     lines = [
         svg.Line(run.method, run.distance, run.errors, style_of(run.method, methods))
         for run in drawing.runs

@@ -124,7 +124,7 @@ def as_text(contents: Sequence[CompareTable], style: str) -> list[str]:
 
 
 def write_files(out: Path, comparison: Comparison) -> None:
-    """compare.csv and compare.tex, and beside.csv and beside.md of a ready comparison, atomically; raises OutputError."""
+    """Write compare.csv and compare.tex, and for a ready comparison beside.csv and beside.md, atomically; raises OutputError."""
     for style in ("csv", "tex"):
         write_text(out / f"compare.{style}", render(comparison, style) + "\n")
     if comparison.beside:

@@ -167,7 +167,7 @@ def run_cards(record: RunRecord, facts: RunFacts, evaluation: Evaluation | None)
 
 
 def _error_card(record: RunRecord, evaluation: Evaluation | None) -> list[Card]:
-    """The first number against ground truth; without, what the run was checked by; empty where nothing checks it."""
+    """Card of the first number against ground truth, else against control points, a map or loops; empty without any."""
     if evaluation is not None:
         scores = [Card(*card) for metric in shown_metrics(evaluation) for card in metric.cards(evaluation)]
         return scores[:1]
@@ -185,7 +185,7 @@ def _error_card(record: RunRecord, evaluation: Evaluation | None) -> list[Card]:
 
 
 def loop_residuals(record: RunRecord) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    """(K,) m between where the final poses have the far end of each closed loop and where its registration put it."""
+    """(K,) m, distance at each closed loop between the newer keyframe's final position and that by the loop's registration."""
     left = []
     for loop in record.loops:
         if loop.is_accepted and loop.constraint is not None:

@@ -237,7 +237,7 @@ def _map_note(manifest: Mapping[str, Any]) -> str:
 
 
 def _differences_note(differences: Mapping[str, Any]) -> str:
-    """What differs between drive and map, in words."""
+    """Sentence on the differences between drive and map."""
     new, gone = count_of(differences["not_in_the_map"], "thing"), count_of(differences["gone"], "thing")
     return (
         f"Against the map: {gone} gone, that beams passed through, and {new} not in it, new or hidden when it was made; by "

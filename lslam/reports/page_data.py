@@ -367,7 +367,7 @@ def candidate_data(record: RunRecord) -> dict[str, Any] | None:
 
 
 def judgement(candidate: LoopCandidate) -> dict[str, Any]:
-    """What was decided; numbers that are not known are None."""
+    """Verdict on a loop candidate as plain values; unknown numbers are None."""
     known = {"rmse": candidate.rmse, "overlap": candidate.overlap, "away": candidate.distance}
     return {
         "verdict": str(candidate.verdict),

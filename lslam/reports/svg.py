@@ -163,7 +163,7 @@ def ticks(low: float, high: float, count: int = 5, whole: bool = False) -> list[
 
 
 def number(value: float, span: float) -> str:
-    """A tick's number with the decimals that `span` asks for, and a real minus sign.
+    """Label of a tick, with decimals that suit the `span` of the axis, and a real minus sign.
 
     >>> number(-0.25, 1.0)
     '−0.25'

@@ -67,7 +67,7 @@ class SimulatedCamera:
 
     @property
     def info(self) -> CameraInfo:
-        """Its calibration for `sequence.toml`."""
+        """Calibration of the camera for `sequence.toml`."""
         lens = self.model.lens
         return CameraInfo(NAME, lens.intrinsics, self.T_lidar_camera, "", lens.model, lens.distortion)
 

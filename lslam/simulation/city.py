@@ -105,7 +105,7 @@ class StreetSite:
         return np.asarray(self.street.beside(np.array([s]), offset)[0])
 
     def yaw(self, s: float, side: int = 1) -> float:
-        """Heading of the street `s` m along it, rad; of its other side against it."""
+        """Heading, rad, of the street `s` m along it; for side -1 the opposite heading."""
         tangent = self.street.tangent(np.array([s]))[0] * side
         return float(portable.arctan2(tangent[1], tangent[0]))
 

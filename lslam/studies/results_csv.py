@@ -51,13 +51,13 @@ _KINDS: dict[str, Callable[[Any], Any]] = {"str": str, "int": int, "float": floa
 
 
 def write_state(path: Path, state: State) -> None:
-    """Write the file atomically; raises OutputError."""
+    """Write the state of a job to its file, atomically; raises OutputError."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_text(path, json.dumps(asdict(state), indent=1) + "\n")
 
 
 def read_state(path: Path) -> State | None:
-    """The state; None when there is none that can be read."""
+    """The state of a job from its file; None when there is no readable file."""
     try:
         tree = parse_json(path.read_text(encoding="utf-8"))
         return State(**{f.name: _KINDS[str(f.type)](tree[f.name]) for f in fields(State)})

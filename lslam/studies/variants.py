@@ -61,7 +61,7 @@ class Variant:
         return self.config.preprocess.downsample == "random" and self.config.odometry.method not in DRAW_NOTHING
 
     def with_seed(self, seed: int) -> Config:
-        """The same configuration with another seed of what it draws."""
+        """The configuration with another random seed for everything that the method draws."""
         return self.config.model_copy(update={"preprocess": self.config.preprocess.model_copy(update={"seed": seed})})
 
 

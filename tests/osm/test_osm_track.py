@@ -29,7 +29,7 @@ def test_prediction_follows_odometry_with_a_sigma_of_one_percent() -> None:
 def test_a_match_of_one_direction_moves_that_direction_only() -> None:
     one = track((2.0, 2.0, 0.0))
     before = one.covariance.copy()
-    one.take(np.array([11.0, 99.0, np.pi / 2]), np.diag([400.0, 0.0, 0.0]))
+    one.correct(np.array([11.0, 99.0, np.pi / 2]), np.diag([400.0, 0.0, 0.0]))
     assert 10.8 < one.pose[0] < 11.0
     assert one.pose[1] == 5.0
     assert one.covariance[0, 0] < 0.1 * before[0, 0]
@@ -50,7 +50,7 @@ def test_the_gate_counts_directions_that_are_seen_and_wraps_the_heading() -> Non
 def test_the_covariance_never_falls_below_that_of_the_map() -> None:
     one = track()
     for _ in range(200):
-        one.take(one.pose, np.diag([1e4, 1e4, 1e6]))
+        one.correct(one.pose, np.diag([1e4, 1e4, 1e6]))
     assert (one.sigma >= MAP).all()
 
 

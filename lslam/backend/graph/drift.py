@@ -186,8 +186,9 @@ def _measurements(graph: PoseGraph) -> tuple[NDArray[np.intp], Floats, Floats]:
 
 
 def _fitting(error: Floats, own: Floats, drift: Floats) -> float:
-    """The factor on `drift` (P, n, n), beside `own`, with which the median error (P, n) has its expected size.
+    """The factor on the covariances `drift` with which the median of the errors has its expected size.
 
+    error : (P, n); own, drift : (P, n, n), covariance without drift, and of drift of factor 1
     0 where `own` is enough, and `LARGEST` at most.
     """
     typical = quantile(0.5, error.shape[1])
@@ -216,9 +217,9 @@ def linear_basis(distances: Floats, apart: float = MEMORY_M) -> Floats:
 
 
 def mean_rates(distances: Floats, at_knots: Floats, rates: Floats, covariance: Floats) -> tuple[Floats, Floats]:
-    """Mean over the way (d,), and its sigmas, of `rates` (n d,) at the knots, whose `covariance` is (n d, n d).
+    """Mean rates (d,) over the way, and their sigmas (d,), from `rates` (n d,) at the knots with covariance (n d, n d).
 
-    at_knots : (K-1, n) of `linear_basis`
+    distances : (K,) m travelled at the keyframes; at_knots : (K-1, n) of `linear_basis`
     """
     shares = np.diff(distances) / np.ptp(distances)
     mean = np.kron(shares @ at_knots, np.eye(len(rates) // at_knots.shape[1]))

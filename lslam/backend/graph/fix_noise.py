@@ -128,10 +128,10 @@ def _likeliest(
     drift: DriftOfFixes,
     least_gain: float,
 ) -> tuple[float, float, float]:
-    """Time constant, s, and variance of the correlated part of `ratios` (F, 3) beside its `white` part, and drift factor.
+    """Time constant, s, and variance of the correlated part of `ratios` (F, 3), and drift factor, of maximum likelihood.
 
+    ratios : residuals in stated sigmas; white : variance of their white part
     slow : (V,) candidate variances; least_gain : log-likelihood that drift must gain
-    ratios : residuals in stated sigmas
     Drift is a random walk, or a constant rate of equal variance at the end of the way. It is accepted where the likelihood,
     marginal over time constants, gains enough.
     """

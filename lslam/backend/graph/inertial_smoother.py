@@ -69,7 +69,7 @@ class InertialSmoother(Stateful):
             self._take(step)
 
     def state(self) -> State:
-        """What `restore` needs to go on from here."""
+        """The steps of the graph so far, for a checkpoint."""
         return {"begun": self._begun, "steps": Records(list(self._steps))}
 
     def restore(self, state: State) -> None:
@@ -128,7 +128,10 @@ class InertialSmoother(Stateful):
         )
 
     def _next_prior(self, state: InertialState) -> InertialState:
-        """The state as a prior of the next graph: gravity has turned with the world of the map while this one held it."""
+        """The newest state as prior of the next graph, with the random walk of gravity's direction over this graph added.
+
+        Gravity turns in the map's world as that drifts.
+        """
         seconds = sum(float(step.seconds.sum()) for step in self._steps)
         covariance = state.covariance.copy()
         along = state.gravity / np.linalg.norm(state.gravity)

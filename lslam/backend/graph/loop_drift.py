@@ -117,7 +117,7 @@ class _Fit:
         )
 
     def likeliest(self) -> tuple[Floats, Floats, float]:
-        """(6 n,) rates at the knots, their covariance (6 n, 6 n), and the random walk beside them."""
+        """Rates (6 n,) at the knots of maximum likelihood, their covariance (6 n, 6 n), and the variance of the random walk."""
         prior, walk = self._choice()
         design = self._rows @ prior
         gain = np.linalg.solve(self._with_walk(walk) + design @ self._rows.T, design).T

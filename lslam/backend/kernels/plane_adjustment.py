@@ -46,9 +46,9 @@ def number_cells(points: Floats, poses: Longs, edge: float) -> tuple[Longs, Long
 
 @kernel
 def place_between(places: Floats, nodes: Floats) -> tuple[Longs, Floats]:
-    """Index (N,) of the last of the ascending `nodes` (M,) before each place (N,), and its share (N,) 0..1 of the way onwards.
+    """Index (N,) of the last of the ascending `nodes` (M,) before each place (N,), and the place's share of the way to the next.
 
-    Places before the first node are at it, those behind the last at the last.
+    Shares (N,) are 0..1. Places before the first node are at it, those behind the last at the last.
     """
     numbers, shares = np.empty(len(places), np.int64), np.zeros(len(places))
     for i in range(len(places)):

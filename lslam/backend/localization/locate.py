@@ -263,7 +263,10 @@ class MapFollower(Stateful):
 
     @property
     def covariance(self) -> Floats:
-        """(6, 6) of the pose, with the drift that does not average out: in proportion to the way, its turn to the way squared."""
+        """(6, 6) covariance of the pose: that of independent steps, and of steady drift since the last accepted scan.
+
+        The drift's sigma grows with the way in rotation, and in translation also with its square.
+        """
         c = self.config.loops
         turn = np.deg2rad(c.drift_deg) / 100 * self.way
         move = 0.01 * c.drift_percent * self.way + 0.5 * turn * self.way

@@ -131,7 +131,10 @@ class Chain:
         return positive(b.covariance - noise.transport(a.covariance, step)) + least
 
     def _break(self, n: int) -> Constraint:
-        """Constraint between session `n` and the end of the one before, with odometry's drift over the ways between them."""
+        """Constraint from the end of the session before to the begin of session `n`, as these were located in each other.
+
+        Its covariance has odometry's drift over the ways between them.
+        """
         session, last = self.sessions[n], int(self.firsts[n]) - 1
         T = se3.relative(self._whole[n - 1][-1], self._whole[n][0])
         assert session.start is not None
@@ -156,7 +159,7 @@ class Vicinity:
     reach: float
 
 
-def tie(
+def locate_session(
     session: Session,
     others: Sequence[Session],
     config: Config,

@@ -59,7 +59,4 @@ class PlaceDescriptor(Protocol):
         """Describe the cloud (N, 3), m, round keyframe `number`, level with z up; keyframes come once, in any order."""
 
     def nearest(self, number: int, others: Longs, turn: float = math.pi) -> list[PlaceMatch]:
-        """Those of the keyframes `others` that look most like keyframe `number`, the best first; all must be known.
-
-        turn : rad, headings differ by no more
-        """
+        """Matches of keyframe `number` among the keyframes `others`, the most similar first; all must have been added."""

@@ -311,7 +311,7 @@ class WorkingMemory:
             insort(self._order, self._key(place))
 
     def _retrieve(self, loop: int) -> None:
-        """Enter a few neighbours of the loop's older place, the nearest along the way first."""
+        """Enter a few places around place `loop`, the older one of a loop, the nearest along the way first."""
         entered = 0
         for step in range(1, LOOP_PLACES + 1):
             for place in (loop + step, loop - step):

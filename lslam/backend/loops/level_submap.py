@@ -117,7 +117,7 @@ def make_level_submap(points: Points, config: RegistrationConfig) -> LevelSubmap
 
 
 def _source(target: GaussianMap, slots: Longs) -> PreparedPoints:
-    """Means of voxels with the scatter round them."""
+    """Source points: means of the voxels in `slots`, with the scatter of the points in each."""
     s = target.moments[slots] / np.maximum(target.moments[slots, :1], 1.0)
     mean = s[:, 1:4]
     outer = mean[:, (0, 0, 0, 1, 1, 2)] * mean[:, (0, 1, 2, 1, 2, 2)]
@@ -149,10 +149,10 @@ class BevGrid:
         return np.where(inside, cells[:, 0] * self.size + cells[:, 1], 0), inside
 
     def view(self, points: Floats, ground: Floats, R: Floats = NO_ROTATION) -> Image:
-        """(3, size, size) of what stands there, points (N, 3), m, and of the ground (M, 3), turned by R (2, 2) first.
+        """Image (3, size, size) of objects, points (N, 3), m, and of the ground, points (M, 3), m, rotated by R (2, 2).
 
-        Structure: occupied voxels per cell, up to `MOST_VOXELS`; points are means of voxels. Its square. Visibility: 1 in cells
-        that hold a point of either, and in their neighbours, else 0.
+        First the occupied voxels per cell, up to `MOST_VOXELS`; points are means of voxels. Second its square. Third visibility:
+        1 in cells that hold a point of either, and in their neighbours, else 0.
         """
         images = np.zeros((3, self.size, self.size), np.float32)
         bev.view(points, ground, R, self.cell, MOST_VOXELS, images)
@@ -190,14 +190,14 @@ class VisibleCells:
     least_share: float
 
     def count(self, points: Floats) -> int:
-        """How many of the points (N, 3), m, lie in these cells; 0 for less than the share."""
+        """Number of the points (N, 3), m, that lie in visible cells; 0 if that is less than `least_share` of them."""
         cells, inside = self.grid.cells_of(points)
         count = int((inside & self.visible[cells]).sum())
         return 0 if count < self.least_share * len(points) else count
 
 
 def blur(image: Image) -> Image:
-    """Mean over a cell and the eight round it."""
+    """The image with each cell replaced by the mean of the cell and its eight neighbours."""
     from scipy import ndimage
 
     return np.asarray(ndimage.uniform_filter(image, 3, mode="constant"))

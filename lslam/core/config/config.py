@@ -65,7 +65,7 @@ def unit_of(key: str) -> str:
 
 
 def with_unit(key: str, label: str = "") -> str:
-    """A key, or the label in its place, as axes and columns name it.
+    """Label of axes and columns for a key: the key, or `label`, with the unit if there is one.
 
     >>> with_unit("map.voxel"), with_unit("map.voxel", "voxel"), with_unit("input.skip_frames")
     ('map.voxel, m', 'voxel, m', 'input.skip_frames')

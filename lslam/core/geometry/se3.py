@@ -78,7 +78,7 @@ def normalise(T: NDArray[Any]) -> Floats:
 
 
 def magnitude(T: Floats) -> tuple[float, float]:
-    """How far one motion (4, 4) goes, m, and by how much it turns, rad."""
+    """Length of the translation, m, and angle of the rotation, rad, of one motion (4, 4)."""
     return float(np.linalg.norm(T[:3, 3])), float(so3.angle(T[:3, :3]))
 
 

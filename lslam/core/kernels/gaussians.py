@@ -158,7 +158,7 @@ def _refresh(
 def breadth_of(
     xx: float, xy: float, xz: float, yy: float, yz: float, zz: float, dx: float, dy: float, dz: float
 ) -> float:
-    """Smaller variance, m2, of points of covariance xx..zz perpendicular to the direction d of the beams that measured them.
+    """Smaller of the two variances, m2, across the direction d of the beams, of points with covariance xx..zz.
 
     It is the smaller eigenvalue of the covariance projected along d: the variance about the best plane that contains d. d has
     any length; 0 for none.

@@ -240,7 +240,7 @@ class BuildingCorrection:
 
     @property
     def confidence(self) -> float:
-        """Probability, by the covariance, that it stands within `INLIER_M` m of its place along both axes of its uncertainty."""
+        """Probability that the building stands within `INLIER_M` m of its estimated place, along both axes of its uncertainty."""
         variances = np.maximum(np.linalg.eigvalsh(self.covariance[:2, :2]), 1e-12)
         return float(np.prod([erf(INLIER_M / sqrt(2 * v)) for v in variances]))
 

@@ -89,7 +89,10 @@ class LoopCandidate:
 
     @property
     def doubt(self) -> float:
-        """How much a person should look at it, 0 to 1: accepted with little overlap, or rejected late and with much."""
+        """Doubt about the verdict, 0 to 1: large if accepted with little overlap, or rejected late and with much.
+
+        A person looks at the most doubtful candidates first.
+        """
         overlap, stages = float(np.nan_to_num(self.overlap)), list(LoopStage)
         if self.is_accepted:
             return 0.0 if self.stage == LoopStage.MANUAL else 1.0 - overlap

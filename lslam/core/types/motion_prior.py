@@ -33,7 +33,7 @@ class MotionPrior:
 
     @classmethod
     def at_once(cls, pose: Floats) -> MotionPrior:
-        """The pose (4, 4) at the stamp, and nothing of the motion about it."""
+        """A prior of one instant: the pose (4, 4) at the stamp, without motion within the sweep."""
         return cls(np.zeros(1), pose[None])
 
     @property

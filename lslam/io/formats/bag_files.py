@@ -215,7 +215,7 @@ def _copies(files: list[list[Topic]]) -> dict[int, int]:
 
 
 def _is_within(topics: list[Topic], others: list[Topic]) -> bool:
-    """True when the other files hold every message of a file, by topic and time."""
+    """Whether every message of a file, its `topics`, is also in another file, `others`, by topic and time."""
 
     def has_all(stamps: Longs, others_ns: Longs) -> bool:
         is_around = len(stamps) > 0 and stamps[0] <= others_ns[0] and others_ns[-1] <= stamps[-1]

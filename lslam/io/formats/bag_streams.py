@@ -94,7 +94,7 @@ def read_poses(bag: Bag, topic: BagTopic, problems: list[str]) -> Stream:
 
 
 def read_twists(bag: Bag, topic: BagTopic, problems: list[str]) -> Stream:
-    """Speeds (N, 9) of an Odometry or TwistStamped topic: m/s along x, rad/s about z, and the pose beside them.
+    """Speeds (N, 9) of an Odometry or TwistStamped topic: m/s along x, rad/s about z, and the pose of the same message.
 
     The pose is position, m, and quaternion xyzw, NaN of a TwistStamped. The stream's frame is that of the twist.
     """

@@ -135,7 +135,10 @@ def write_labels(path: Path, labels: NDArray[np.uint16]) -> None:
 
 
 def read_array(path: Path) -> NDArray[Any]:
-    """An array of points: structured and flat, or numbers (N, K). Raises InputError for anything else."""
+    """Read the array of points in a .npy file: structured (N,), or numbers (N, K); organised clouds become (N, K) row by row.
+
+    Raises InputError for anything else.
+    """
     kinds = (*MISFIT, EOFError, SyntaxError, MemoryError, TokenError)
     with input_errors(path, *kinds, as_what="a NumPy array"), HEADERS, path.open("rb") as stream:
         table = np.lib.format.read_array(stream, allow_pickle=False)

@@ -237,10 +237,10 @@ def _lateness(stamps: Stamps) -> tuple[Stamps, Bools]:
     if not (late > 0).any() or not (steps > 0).any():
         return late, np.zeros(len(stamps), bool)
     step = float(np.median(steps[steps > 0]))
-    return late, (late > max(_LATE_NS, _LATE_STEPS * min(step, _LATE_NS))) | _told_again(stamps, late, step)
+    return late, (late > max(_LATE_NS, _LATE_STEPS * min(step, _LATE_NS))) | _repeats_span(stamps, late, step)
 
 
-def _told_again(stamps: Stamps, late: Stamps, step: float) -> Bools:
+def _repeats_span(stamps: Stamps, late: Stamps, step: float) -> Bools:
     """(N,) whether late messages repeat a span of time that earlier ones covered, since a clock was set back.
 
     Their stamps then lie among those of others and fill no gap.

@@ -164,7 +164,7 @@ def bag_cameras(
 def _bag_camera(
     bag: Bag, topic: BagTopic, links: Links, lidar: str, ahead: Ahead, infos_in_toml: tuple[str, CameraInfo] | None
 ) -> Camera:
-    """Camera of an image topic, with lens and extrinsics by `infos_in_toml`, else by the bag. Raises InputError without them."""
+    """Camera of an image topic, with lens and extrinsics by `infos_in_toml`, else by the bag; InputError without these."""
     heads = [(k, head) for k, head in bag.each(topic, partial(read_header, topic), links.voice.problems, HEADER)]
     if not heads:
         raise InputError(f"{topic.name} has no image that can be read")

@@ -255,7 +255,10 @@ def _absolute(past_hour_us: Longs, captured_ns: Longs, voice: Voice) -> Longs:
 
 
 def _unwrap(path: Path, angle: Longs, times_ns: Longs) -> tuple[Longs, float]:
-    """Azimuths from the first, 0.01 deg, unwrapped by the rate, and that, 0.01 deg/ns; InputError if times leap or it stands."""
+    """Azimuths unwrapped, 0.01 deg from the first, and the rate of rotation, 0.01 deg/ns.
+
+    angle : (P,) 0.01 deg of each packet. Raises InputError if the times leap or the sensor does not turn.
+    """
     steps, spans = np.diff(angle) % TURN, np.diff(times_ns)
     if len(spans) and float(np.abs(spans.astype(np.float64)).max()) > _LONGEST_NS:
         raise InputError(f"{path}: the times of its packets leap by days: the capture is damaged")

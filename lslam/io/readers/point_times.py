@@ -62,7 +62,7 @@ class Sample:
         return len(self.cloud)
 
     def thin(self, most: int) -> Sample:
-        """The same with `most` points, or a few more where it has fewer than twice as many."""
+        """The sample with every n-th point, `most` or somewhat more of them."""
         step = max(len(self) // most, 1)
         return Sample(self.cloud.select(np.arange(0, len(self), step)), self.stamp_ns, step)
 

@@ -202,7 +202,7 @@ class OdometryCheckpoints:
             self._write(results, tracker, keyframing, is_over=False)
 
     def close(self, results: list[ScanResult], tracker: WindowTracker, keyframing: Keyframing, is_over: bool) -> None:
-        """Write the last one: odometry is over, or somebody asked to stop."""
+        """Write the last checkpoint, when odometry is over (`is_over`) or was asked to stop."""
         if (is_over and not self.is_over) or (not is_over and isinstance(tracker.present.odometry, Resumable)):
             self._write(results, tracker, keyframing, is_over)
 
@@ -213,7 +213,7 @@ class OdometryCheckpoints:
         if not is_over and (keyframing.is_waiting or not tracker.is_complete):
             return  # the next scan is needed to say what the first one was
         if is_over:
-            keyframing.settle()
+            keyframing.finalise()
 
         def content() -> State:
             return {

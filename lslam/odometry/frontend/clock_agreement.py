@@ -82,7 +82,7 @@ class _KnownSteps(ConstantVelocity):
     def correct(
         self, stamp_ns: int, pose: Floats, prior: MotionPrior | None = None, has_registration: bool = True
     ) -> None:
-        """As constant velocity, with the next step in place of the last."""
+        """Update by the pose (4, 4), and take the next of the known motions as the velocity."""
         super().correct(stamp_ns, pose, prior, has_registration)
         self._twist, self._step_s = self._steps[min(self._next, len(self._steps) - 1)]
         self._next += 1
@@ -137,7 +137,7 @@ class ClockWindow:
         return self._scores[clock]
 
     def is_astray(self, clock: SweepClock | None) -> bool:
-        """Whether odometry found another motion under the clock than the window has, so that its scores say nothing."""
+        """Whether odometry under the clock found another motion than without, so that the scores cannot be compared."""
         return bool((self.scores(clock) >= _WORST_SCORE).all())
 
     def _place(self, clock: SweepClock | None, config: Config, motion: ConstantVelocity | None) -> list[_ScanAtPose]:

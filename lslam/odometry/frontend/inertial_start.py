@@ -99,7 +99,7 @@ def _require_rate(sequence: Sequence, imu: ImuStream, method: str) -> None:
 
 
 def save_start(path: Path, part: Inertial) -> None:
-    """Keep what `begin_inertial` found, for `load_start`. Raises OutputError."""
+    """Write the result of `begin_inertial` to `path`, for `load_start`. Raises OutputError."""
     write_state(path, {"start": part.start, "notes": part.notes, "problems": part.problems})
 
 
@@ -323,7 +323,7 @@ def calibration_of(gyroscope: Gyroscope, opening: InertialStart) -> dict[str, An
 
 
 def motion_of(opening: InertialStart, config: Config) -> InertialMotion:
-    """The motion model that the method asks for: `create_motion` of its module, where it has one."""
+    """Create the motion model of the method: by `create_motion` of its module if it has one, else `InertialMotion`."""
     create: Callable[[InertialStart, Config], InertialMotion] = InertialMotion
     if config.odometry.method in METHODS:
         module, _ = METHODS[config.odometry.method]
@@ -332,7 +332,7 @@ def motion_of(opening: InertialStart, config: Config) -> InertialMotion:
 
 
 def copy_of(motion: InertialMotion, opening: InertialStart, config: Config) -> InertialMotion:
-    """A second model of the same IMU that goes on where `motion` is."""
+    """A second motion model of the same IMU, in the state of `motion`."""
     other = motion_of(opening, config)
     other.restore(deepcopy(motion.state()))
     return other

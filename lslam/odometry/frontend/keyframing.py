@@ -143,7 +143,7 @@ class Keyframing(Stateful):
         else:
             self._make(keyframe, scan, motion)
 
-    def settle(self) -> None:
+    def finalise(self) -> None:
         """Write all pending keyframes to the store, wait for them, and save its index."""
         self._make_unknown(None)
         self._wait(0)
@@ -155,7 +155,7 @@ class Keyframing(Stateful):
         return bool(self._unknown)
 
     def state(self) -> State:
-        """What `restore` needs to go on from here; waits for the clouds on their way."""
+        """State for a checkpoint, after waiting for the pending clouds."""
         self._wait(0)
         return super().state()
 

@@ -97,7 +97,7 @@ def _by_agreement(
 
 
 def _decide(sequence: Sequence, proposal: Proposal, sample: Scan, preprocess: PreprocessConfig) -> ClockChoice:
-    """As `choose_clock`, with the kernels compiled before."""
+    """Compile the kernels, and choose the clock by `choose_clock`."""
     with jit.announce_compiling(log):
         create_odometry(Config()).warm_up()
         return choose_clock(sequence, proposal, sample, preprocess)

@@ -96,7 +96,7 @@ def estimate(
 def _observe(
     track: TrackedScan, position: int, keyframing: Keyframing | None, monitor: IntegrityMonitor | None
 ) -> ScanResult:
-    """The scan's result with its times, after keyframing and monitor processed it."""
+    """Hand the scan to keyframing and monitor. Returns its result with the times of all stages."""
     entry, result = track.entry, track.result
     stages = {"read": entry.read_s, "prepare": entry.prepare_s, **result.stages}
     if keyframing is not None:
@@ -130,12 +130,12 @@ def sweep_of(sequence: Sequence) -> Span | None:
 
 
 def diverges(results: list[ScanResult]) -> bool:
-    """Whether fewer than half of the scans were registered and stand in one frame, that of the trajectory."""
+    """Whether fewer than half of the scans were registered in the frame of the trajectory."""
     return sum(r.status == "ok" and r.frame == 0 for r in results) < max(1, len(results) // 2)
 
 
 def between_middles(result: ScanResult, middle: tuple[int, Floats], following: TrackedScan) -> ScanResult:
-    """The result with its stamp's pose interpolated between the middles of this sweep and the next, if it lies between them.
+    """The result with `stamp_offset`, by interpolation between the middles of its sweep and the next, if the stamp lies between.
 
     middle : instant, ns, and pose of the middle of its own sweep
 

@@ -34,7 +34,7 @@ LENGTHS = {
 
 
 def with_scene_scale(config: Config, sequence: Sequence) -> Config:
-    """The configuration with its default lengths in proportion to the scene, where that is small; a note of it."""
+    """As `in_scale`, with a note of the sequence on the voxel size if the scene is small."""
     scaled = in_scale(config, sequence)
     if scaled != config:
         voxel_m = scaled.registration.voxel_size

@@ -125,7 +125,7 @@ class SegmentTracker(Stateful):
         self._other, self._open = None, []
 
     def _new_segment(self) -> list[TrackedScan]:
-        """Continue with the tracker of the new map; returns the scans since, as it registered them."""
+        """Continue with the tracker of the new map. Returns the undecided scans as that tracker registered them."""
         assert self._other is not None
         registered = [other for _, other in self._open]
         # The motion model is known to others by its first object.

@@ -131,11 +131,11 @@ class Tracker(Stateful):
         return self._first is None
 
     def state(self) -> State:
-        """What `restore` needs to go on from here; of a method that is not `Resumable`, only what is around it."""
+        """State for a checkpoint; of a method that is not `Resumable`, only that of the tracker and the motion model."""
         return {**super().state(), "odometry": self.odometry.state() if isinstance(self.odometry, Resumable) else None}
 
     def restore(self, state: State) -> None:
-        """Go on where `state` was taken."""
+        """Replace the state by `state`."""
         if isinstance(self.odometry, Resumable) and state["odometry"] is not None:
             self.odometry.restore(state["odometry"])
         super().restore(state)
@@ -191,7 +191,7 @@ class Tracker(Stateful):
             self.sweep = self.motion.refine(prior, result.stamp_ns, pose) if is_blind else prior
             self.motion.correct(result.stamp_ns, pose, prior, is_ok)
             if self._window_method is not None:
-                self._window_method.settle(self.motion.poses() if isinstance(self.motion, WindowMotion) else {})
+                self._window_method.finalise(self.motion.poses() if isinstance(self.motion, WindowMotion) else {})
         middle, instant_ns = middle_of(prior, result.stamp_ns, pose)
         self.middle = (instant_ns, middle)
 
@@ -265,12 +265,12 @@ def _fuse_with(
     """Registration fused by the motion model. A window is fused with the scan's normal equations, and once more if it moved."""
     if not (isinstance(motion, WindowMotion) and isinstance(odometry, WindowMethod)):
         return motion.fuse(stamp_ns, result, prior)
-    motion.take(odometry.equations(stamp_ns, result))
+    motion.set_equations(odometry.equations(stamp_ns, result))
     fused = motion.fuse(stamp_ns, result, prior)
     again = odometry.equations_at(motion.stale())
     if not again:
         return fused
-    motion.take(again)
+    motion.set_equations(again)
     return motion.fuse(stamp_ns, result, prior)
 
 
@@ -306,11 +306,11 @@ def _matrix_norm(prior: Floats, pose: Floats) -> float:
 
 
 def _distance(before: MotionPrior, after: MotionPrior) -> float:
-    """How far the motion from a sweep's start to its end differs, m, at a lever arm of `LEVER_M`."""
+    """Difference, m, of two motions from the start to the end of a sweep, rotations at a lever arm of `LEVER_M`."""
     return apart(*(se3.relative(prior.poses[0], prior.poses[-1]) for prior in (before, after)))
 
 
 def apart(a: Floats, b: Floats) -> float:
-    """How far two poses (4, 4) are apart, m, at a lever arm of `LEVER_M`."""
+    """Distance, m, of two poses (4, 4), their rotation at a lever arm of `LEVER_M`."""
     move, turn = se3.magnitude(se3.relative(a, b))
     return move + LEVER_M * turn

@@ -73,7 +73,7 @@ def _priors(tracks: list[TrackedScan]) -> list[MotionPrior]:
     return out
 
 
-def _tie(track: TrackedScan, position: Floats, covariance: Floats) -> TrackedScan:
+def _with_start_error(track: TrackedScan, position: Floats, covariance: Floats) -> TrackedScan:
     """The scan with the covariance (6, 6) of the first pose, at `position` (3,), m, world, added to its own, relative one."""
     result = track.result
     spread = noise.transport(covariance, result.T_world_lidar[:3, 3] - position)
@@ -176,7 +176,7 @@ class WindowTracker(Stateful):
         return self._close() if entry is None or (self._tracker.is_complete and self._is_full()) else []
 
     def state(self) -> State:
-        """What `restore` needs to go on from where the open window begins."""
+        """State for a checkpoint, as it was where the open window begins."""
         return {**super().state(), **({"_tracker": self._begin} if self._scans else {})}
 
     def _is_begin(self, entry: ScanInput | None) -> bool:
@@ -287,7 +287,7 @@ class WindowTracker(Stateful):
         """The scans in the world of the run's corrected first pose, whose covariance is added to theirs."""
         world, start = self._world, self._start
         moved = tracks if world is None else [track.transform(world) for track in tracks]
-        return moved if start is None else [_tie(track, *start) for track in moved]
+        return moved if start is None else [_with_start_error(track, *start) for track in moved]
 
     def _inliers(self) -> list[int]:
         """Number of inliers of each decided scan."""

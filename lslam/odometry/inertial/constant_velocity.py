@@ -96,7 +96,7 @@ class MotionModel(Protocol):
         ...
 
     def state(self) -> State:
-        """What `restore` needs to go on from here."""
+        """State for a checkpoint."""
         ...
 
     def restore(self, state: State) -> None:

@@ -270,7 +270,10 @@ class FilterMotion(InertialMotion):
     def correct(
         self, stamp_ns: int, pose: Floats, prior: MotionPrior | None = None, has_registration: bool = True
     ) -> None:
-        """Update as `InertialMotion.correct`; the states are those of the filter where the scan was fused or predicted by it."""
+        """Update as `InertialMotion.correct`, with the states of the filter.
+
+        They are those that `fuse` updated, those predicted for a scan without registration, or new ones after a gap.
+        """
         predicted, posterior = self._next, self._posterior
         self._next = self._posterior = None
         before = self.estimate

@@ -96,11 +96,11 @@ class InertialMotion(Stateful):
             self.coasting.is_known
             and self._scans % self.COMPARISON_INTERVAL_SCANS == self.COMPARISON_INTERVAL_SCANS - 1
         )
-        return is_due and self._feels(stamp_ns, span)
+        return is_due and self._has_samples(stamp_ns, span)
 
     def sweep(self, stamp_ns: int, span: Span) -> MotionPrior:
         """Predicted poses over the `span` (s) of the sweep at `stamp_ns`, by the IMU, or constant velocity where it has a gap."""
-        self.is_inertial = self._feels(stamp_ns, span)
+        self.is_inertial = self._has_samples(stamp_ns, span)
         if not self.is_inertial:
             return self.coasting.sweep(stamp_ns, span)
         anchor_ns = stamp_ns if self._instant_ns is None else self._instant_ns
@@ -207,7 +207,7 @@ class InertialMotion(Stateful):
         self._scans += 1
 
     def gravity_at(self, pose: Floats) -> GravityDirection | None:
-        """Which way is down for a LiDAR at `pose` (4, 4) in the world, as of the last scan; None where that is not known.
+        """Direction of gravity in the axes of a LiDAR at `pose` (4, 4), as of the last scan; None where it is unknown.
 
         The filter knows gravity in a world that registration lets drift; a LiDAR that turned with it sees the true one.
         """
@@ -217,7 +217,7 @@ class InertialMotion(Stateful):
         return GravityDirection(pose[:3, :3].T @ direction, sigma)
 
     def imu_state(self) -> ImuState | None:
-        """What the filter knows of the IMU as of the last scan; None once it is refused."""
+        """Errors of the IMU as the filter estimates them after the last scan; None once the IMU is refused."""
         return None if self.refusal else self.estimate.summary
 
     def rewind(self, stamp_ns: int, pose: Floats, span: Span) -> MotionPrior:
@@ -266,7 +266,10 @@ class InertialMotion(Stateful):
         return self.estimate.correct(self.imu, step, a[:3, :3], b[:3, :3], b[:3, 3] - a[:3, 3], gyroscope, noise)
 
     def _level_along_x(self, instant_ns: int, middle: Floats) -> ImuEstimate:
-        """The estimate of a LiDAR that neither slips sideways nor tilts: the speed is the way since the last scan over time."""
+        """The estimate with the velocity along the LiDAR's x axis, and gravity along its z axis, for a start without motion.
+
+        The speed is the distance from the last scan's pose to `middle` (4, 4) over the time between.
+        """
         assert self._instant_ns is not None
         way = float(np.linalg.norm(middle[:3, 3] - self._pose[:3, 3]))
         speed = way / (1e-9 * (instant_ns - self._instant_ns))
@@ -319,7 +322,7 @@ class InertialMotion(Stateful):
             )
             log.warning("the IMU is refused from here on: %s", self.refusal)
 
-    def _feels(self, stamp_ns: int, span: Span) -> bool:
+    def _has_samples(self, stamp_ns: int, span: Span) -> bool:
         """Whether the IMU, unless rejected, has samples from the newest pose, or the sweep's begin, to the sweep's end."""
         begin_ns, end_ns = (stamp_ns + round(1e9 * seconds) for seconds in span)
         if self._instant_ns is not None:

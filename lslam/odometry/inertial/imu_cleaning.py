@@ -85,7 +85,7 @@ def clean(imu: ImuStream, first_ns: int, last_ns: int) -> CleanStream:
 
 
 def rate_of(imu: ImuStream) -> float:
-    """Samples per second; 0 for a stream whose time stands."""
+    """Samples per second; 0 for a stream whose stamps do not advance."""
     steps = np.diff(imu.stamps_ns)
     forward = steps[steps > 0]
     return 1e9 / float(np.median(forward)) if len(forward) else 0.0

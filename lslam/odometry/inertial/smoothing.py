@@ -35,7 +35,7 @@ _ESTIMATE = np.r_[6:9, 15:18, 9:12]
 
 
 def smoother_noise(noise: ImuNoise) -> SmootherNoise:
-    """The noise of an IMU as factors take it."""
+    """The noise densities of an IMU for the factors of the smoother."""
     return SmootherNoise(noise.force, noise.accel_walk, noise.gyro_walk, GRAVITY_WALK)
 
 

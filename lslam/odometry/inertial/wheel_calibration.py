@@ -155,7 +155,7 @@ class WheelCalibration:
 
 
 def by_axis(along: float, across: float, direction: Floats) -> Floats:
-    """(3, 3) covariance of one variance along a unit vector (3,) and another across it."""
+    """(3, 3) covariance with the variance `along` a unit vector (3,) and the variance `across` it."""
     return np.asarray(across * np.eye(3) + (along - across) * np.outer(direction, direction))
 
 

@@ -144,7 +144,7 @@ class WheelMotion(ConstantVelocity):
         if reckoning is None:
             return result
         C = result.covariance
-        self._learnt = self._learn_from(reckoning, instant_ns, middle, C + _open(result))
+        self._learnt = self._learn_from(reckoning, instant_ns, middle, C + _unobserved_covariance(result))
         up = self._pose[:3, :3] @ self.calibration.up
         G = np.zeros((6, 4))
         G[:3, :3], G[3:, 3] = self._pose[:3, :3], up
@@ -183,9 +183,9 @@ class WheelMotion(ConstantVelocity):
         super().correct(stamp_ns, pose, prior, has_registration)
 
     def _is_contrary(self, reckoning: ReckonedStep, middle: Floats) -> bool:
-        """Whether constant velocity is nearer to the wheels than to a registration that contradicts them.
+        """Whether a registration contradicts wheels and constant velocity: these are nearer to each other than the latter to it.
 
-        Never twice in a row, as with an IMU: a registration that insists is right.
+        Never twice in a row, as with an IMU: a registration that repeats itself is right.
         """
         if self._was_bridged or self._step_s <= 0:
             return False
@@ -257,7 +257,7 @@ class WheelMotion(ConstantVelocity):
         )
 
 
-def _open(result: RegistrationResult) -> Floats:
+def _unobserved_covariance(result: RegistrationResult) -> Floats:
     """(6, 6) large covariance to add to a registration's, along directions that no surface observes.
 
     There the registration's own covariance is too small. Translation gets it in all axes: an unobserved direction is known to a

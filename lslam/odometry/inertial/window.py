@@ -88,7 +88,7 @@ class Moment:
         """(15,) error of this state relative to `other`: position, rotation, velocity and both biases."""
         return np.concatenate(
             [
-                off_by(other.T_world_imu, self.T_world_imu),
+                pose_error(other.T_world_imu, self.T_world_imu),
                 self.velocity - other.velocity,
                 self.accel_bias - other.accel_bias,
                 self.gyro_bias - other.gyro_bias,
@@ -204,7 +204,7 @@ class Window:
         J[:3, 3:] = -so3.hat(T[:3, 3] - m.T_world_imu[:3, 3])
         own = slice(SHARED + EACH * k, SHARED + EACH * k + 6)
         H[own, own] += J.T @ e.H @ J
-        g[own] += J.T @ (e.g + e.H @ off_by(e.T_world_lidar, T))
+        g[own] += J.T @ (e.g + e.H @ pose_error(e.T_world_lidar, T))
 
     def _add_increments(self, H: Floats, g: Floats, k: int, imu: ImuStream) -> None:
         """Add the IMU factor between moments k - 1 and k, integrated anew with the present biases."""
@@ -232,7 +232,7 @@ class Window:
         led = replace(a, T_world_imu=se3.make(R_end[-1], a.T_world_imu[:3, 3] + moved[-1]), velocity=velocities[-1])
         F = transition(step, R, R_end[-1], Gyroscope(a.gyro_bias, self.axes))
         nanoseconds = b.instant_ns - a.instant_ns
-        W = certainty(nanoseconds, self.rate_variance, self.noise)
+        W = imu_information(nanoseconds, self.rate_variance, self.noise)
         if step.hidden is not None:
             Q = process_noise(1e-9 * nanoseconds, self.rate_variance, self.noise) + cut_noise(step.hidden, F)
             W = linalg.inverse(Q[np.ix_(OWN, OWN)])
@@ -254,7 +254,7 @@ class Window:
         is_first[SHARED : SHARED + EACH] = True
         rest = Normal(H, g).without(is_first)
         walk = GRAVITY_WALK**2 * 1e-9 * (second.instant_ns - first.instant_ns)
-        information, gradient = loosen(rest.H, rest.g, DOWN, walk)
+        information, gradient = add_random_walk(rest.H, rest.g, DOWN, walk)
         past = Past(information, gradient, self.gravity, self.axes, second)
         return replace(self, moments=self.moments[1:], past=past)
 
@@ -271,7 +271,7 @@ class Window:
 
 
 @lru_cache(maxsize=64)
-def certainty(nanoseconds: int, rate_variance: float, noise: ImuNoise) -> Floats:
+def imu_information(nanoseconds: int, rate_variance: float, noise: ImuNoise) -> Floats:
     """(15, 15) information of an IMU factor over so many nanoseconds: the inverse of its process noise; a read-only array."""
     W = np.linalg.inv(process_noise(1e-9 * nanoseconds, rate_variance, noise)[np.ix_(OWN, OWN)])
     W.flags.writeable = False
@@ -284,14 +284,14 @@ def moment_of(state: NavigationState, instant_ns: int, stamp_ns: int, T_imu_scan
     return Moment(instant_ns, stamp_ns, state.T_world_imu, e.velocity, e.accel_bias, e.gyroscope.bias, T_imu_scan)
 
 
-def off_by(a: Floats, b: Floats) -> Floats:
+def pose_error(a: Floats, b: Floats) -> Floats:
     """(6,) error, world axes, by which the pose b (4, 4) is away from a (4, 4)."""
     # The copy is one compiled function less.
     R = np.ascontiguousarray(a[:3, :3])
     return np.concatenate([b[:3, 3] - a[:3, 3], R @ vector_between(R, b[:3, :3])])
 
 
-def loosen(H: Floats, g: Floats, part: slice, variance: float) -> tuple[Floats, Floats]:
+def add_random_walk(H: Floats, g: Floats, part: slice, variance: float) -> tuple[Floats, Floats]:
     """Normal equations H, g after the variables `part` moved by a random walk of `variance`.
 
     Their values before it are marginalised by the Schur complement.
@@ -322,7 +322,7 @@ class WindowMotion(FilterMotion):
         self._equations, self._joint = {}, None
         return super().sweep(stamp_ns, span)
 
-    def take(self, equations: Iterable[ScanEquations]) -> None:
+    def set_equations(self, equations: Iterable[ScanEquations]) -> None:
         """Store the normal equations of some scans for the next joint estimates."""
         self._equations |= {one.stamp_ns: one for one in equations}
 
@@ -351,7 +351,7 @@ class WindowMotion(FilterMotion):
         moved = {}
         for m in () if self._joint is None else self._joint.moments:
             if m.equations is not None:
-                off = off_by(m.equations.T_world_lidar, m.T_world_lidar)
+                off = pose_error(m.equations.T_world_lidar, m.T_world_lidar)
                 if np.linalg.norm(off[:3]) + LEVER_M * np.linalg.norm(off[3:]) > STALE_M:
                     moved[m.stamp_ns] = m.T_world_lidar
         return moved

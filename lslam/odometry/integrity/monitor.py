@@ -146,7 +146,10 @@ class IntegrityMonitor(Stateful):
         )
 
     def _empty_share(self, first: ReferenceScan, last: ReferenceScan, scan: Scan) -> float:
-        """Share of directions that were filled when the poses came to a stand, and are empty now that they still stand."""
+        """Share of the viewing directions that had points when the poses stopped moving, and have none now, still at rest.
+
+        0 where the poses move.
+        """
         if self._stand is not None and is_still(se3.relative(self._stand[0], last.pose)):
             return empty_share(self._stand[1], filled_directions(scan.points))
         stands = is_still(se3.relative(first.pose, last.pose))

@@ -55,13 +55,13 @@ def upright_plane(
 def flat_walls(
     points: NDArray[np.float32], used_points: Longs, cell: float, tilt: float, thickness: float, thin: float
 ) -> tuple[Floats, Floats]:
-    """Rows of `flat` (M, 5) for the points on vertical planes, one row per cell of `thin`, m; and all points thinned likewise.
+    """Points on vertical planes, thinned: one row of (M, 5) per cell of `thin`, m: x, y, normal x, y, and number of points.
 
     points : (N, 3), m; used_points : (K,) their indices in `points`
     cell : m; the neighbourhood of a point is the eight cells about the nearest corner of their lattice
     tilt : largest vertical component of the unit normal; thickness : largest standard deviation across the plane, m
 
-    The second result (L, 3) has x, y and number of the points in each cell.
+    The second result (L, 3) has x, y and number of all used points in each cell.
     """
     n = len(used_points)
     entries = table_size(n)

@@ -260,7 +260,7 @@ def accuracy(survey: Survey) -> list[str]:
 
 
 def precision_note(survey: Survey) -> str:
-    """What standard deviations of the poses are relative to, in words."""
+    """Sentence on what the standard deviations of the poses are relative to."""
     georeference = next(iter(survey.drives.values())).georeference
     is_absolute = georeference is not None and georeference.is_in_graph
     return "internal precision " + ("in the delivered coordinates" if is_absolute else "relative to the first pose")
@@ -319,7 +319,7 @@ def _north(projection: Projection) -> str:
 
 
 def limits(survey: Survey) -> list[str]:
-    """What a user of the data must know: how the run ended, and why."""
+    """Sentences on how the run ended, and why, which a user of the data must know."""
     if survey.status == "done":
         return ["The run ended as done.", *survey.problems]
     warning = ": this is no finished result, and was delivered on request (--anyway)"

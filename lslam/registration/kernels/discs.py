@@ -54,7 +54,10 @@ def source_discs(
 
 @inline
 def keep(i: int, slots: Ints, rows: Floats, column: int, least: float) -> None:
-    """Of the slots (8,) of point i leave those whose entry in a `column` of `rows` (C, N) is above `least`, before all -1."""
+    """Remove from the slots (8,) of point i those whose value in a `column` of `rows` (C, N) is not above `least`.
+
+    The others move to the front; the rest are -1.
+    """
     used = 0
     for k in range(8):
         s = slots[i, k]

@@ -202,7 +202,7 @@ def cluster(
 
 
 @kernel
-def give_back(
+def point_labels(
     ranges: Floats,
     order: NDArray[np.int64],
     pixel: NDArray[np.int64],

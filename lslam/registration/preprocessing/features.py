@@ -115,7 +115,7 @@ def extract_features(scan: Scan, config: LoamConfig | None = None, gate: Preproc
 
 
 def features_along(scan: Scan, walk: RingWalk, config: LoamConfig, may_be: NDArray[np.uint8] | None = None) -> Features:
-    """As `extract_features`, of a scan whose rings are walked already.
+    """Features of a scan along the given `walk` of its rings, as `extract_features`.
 
     may_be : (N,) of each point of the scan, a sum of MAY_BE_EDGE, MAY_BE_FLAT and MAY_BE_PLANE; None allows all
     """
@@ -190,8 +190,9 @@ def walk_rings(scan: Scan, gate: PreprocessConfig) -> RingWalk:
 
 
 def _spin_axis(directions: Floats, starts: Longs) -> Floats:
-    """(3,) unit vector about which rings of directions (K, 3) are circles; z where there is none, or within 45 deg of it.
+    """(3,) unit vector about which the rings of directions (K, 3) are circles: the sensor's axis of rotation.
 
+    z where there is no such axis, or it is within 45 deg of z. starts : first point of each ring
     A circle about an axis has no extent along it, and errors of elevation are far smaller than the widest step.
     """
     sizes = np.diff(starts)

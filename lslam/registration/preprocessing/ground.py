@@ -158,7 +158,7 @@ AXIS = Up(Z, "axis")
 
 
 def find_up(points: NDArray[np.float32], gravity_up: Floats | None = None) -> Up:
-    """Up among points (N, 3), m, as seen from the sensor; z where that is within 45 deg, or where nothing says otherwise.
+    """Up in the LiDAR frame of points (N, 3), m, by gravity or the ground; z where that is within 45 deg, or by default.
 
     gravity_up : (3,) unit vector, up as an IMU measures it, which ground about it makes precise. It counts unless there is
         ground about z and none about it: then its sign or its axes are wrong.

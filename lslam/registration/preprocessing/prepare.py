@@ -145,7 +145,7 @@ def few_of(points: PreparedPoints) -> PreparedPoints:
 
 
 def subset(points: PreparedPoints, which: slice | Bools | Longs) -> PreparedPoints:
-    """Some of the source points, or all in another order, with what goes with each; the map points stay."""
+    """The points with the source points that `which` selects or reorders, and all that belongs to each; map points stay."""
     times, covariance, gaps = points.source_times, points.covariance, points.gaps
     return replace(
         points,
@@ -197,7 +197,7 @@ def gate_points(points: NDArray[np.float32], config: PreprocessConfig) -> Longs:
 
 
 def _gate_of(config: PreprocessConfig) -> tuple[float, float, bool, Floats]:
-    """Range gate and ego box as the kernels take them."""
+    """Range limits, m, whether ranges are horizontal, and ego box, as `voxel.gate` takes them."""
     box = np.array(config.ego_box if config.ego_box is not None else (), np.float64)
     return config.range_min, config.range_max, config.range_shape == "cylinder", box
 

@@ -147,7 +147,7 @@ def _cut_rings(points: NDArray[Any]) -> tuple[NDArray[np.uint16] | None, float]:
     if ahead < _AHEAD:
         return None, 0.0
     before = np.maximum(jumps - 1, 0)
-    seam = _stab(turned[before], turned[jumps])
+    seam = _most_covered_angle(turned[before], turned[jumps])
     rings, slopes, counts = ring_order.cut_rings(turned, slope, seam)
     if not FEWEST <= len(counts) <= MOST or counts.mean() < _LEAST_PER_RING or not _is_staircase(slopes):
         return None, seam
@@ -163,7 +163,7 @@ def _is_staircase(values: Floats) -> bool:
     return bool(falls_through and usual > _CLOSEST and (gaps > 0.25 * usual).mean() > 0.9)
 
 
-def _stab(start: Floats, end: Floats) -> float:
+def _most_covered_angle(start: Floats, end: Floats) -> float:
     """The angle within 0..2 pi that most of the arcs from `start` to `end` (M,), rad, contain: the middle of their overlap."""
     full = 2 * np.pi
     low = np.remainder(start, full)

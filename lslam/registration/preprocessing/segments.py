@@ -99,7 +99,9 @@ def _segment(scan: Scan, walk: RingWalk, vertical: Floats) -> Segments:
         np.radians(SEGMENT_ANGLE_DEG),
         (SEGMENT_POINTS, SMALL_SEGMENT_POINTS, SMALL_SEGMENT_RINGS),
     )
-    return Segments(*range_image.give_back(walk.ranges, walk.order, pixel, nearest, ground, labels, _SAME, len(scan)))
+    return Segments(
+        *range_image.point_labels(walk.ranges, walk.order, pixel, nearest, ground, labels, _SAME, len(scan))
+    )
 
 
 def _floor(walk: RingWalk, lowest: Longs, vertical: Floats) -> tuple[Floats, float]:

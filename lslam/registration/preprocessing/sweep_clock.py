@@ -105,7 +105,7 @@ class _Blocks:
         sizes = np.diff(np.append(starts, len(where)))
         cosine, sine, middle = (
             np.add.reduceat(values[where], starts) / sizes
-            for values in (_over(x, flat), _over(y, flat), np.arange(len(points), dtype=np.float64))
+            for values in (_quotient(x, flat), _quotient(y, flat), np.arange(len(points), dtype=np.float64))
         )
         angles = np.arctan2(sine, cosine)
         steps = np.remainder(np.diff(angles) + np.pi, _FULL) - np.pi
@@ -125,7 +125,7 @@ def _is_even(steps: Floats) -> bool:
     return bool((steps > 0).mean() > _STRAIGHT)
 
 
-def _over(values: Floats, by: Floats) -> Floats:
+def _quotient(values: Floats, by: Floats) -> Floats:
     """Quotient of values by the positive ones of `by`, elsewhere 0."""
     return np.divide(values, by, out=np.zeros_like(values), where=by > 0)
 
@@ -328,7 +328,10 @@ def order_clock(scans: list[Scan], nominal: SweepClock) -> SweepClock | None:
 
 
 def azimuth_proposal(scans: list[Scan], nominal: SweepClock) -> Proposal:
-    """The azimuth, its sense and where sweeps begin by the order of the points as far as that tells them."""
+    """A clock by the azimuth of each point; the order of the points gives the sense and the begin of sweeps if it can.
+
+    Otherwise the proposal is a guess: counter-clockwise, from -x.
+    """
     guess = replace(nominal, kind="azimuth", sense=1, begin_rad=-np.pi)
     by_order = order_clock(scans, nominal)
     if by_order is not None and by_order.begin_rad is not None:

@@ -49,7 +49,7 @@ class ClockView(SequenceView):
         self._clocks = [(0, clock), *later]
 
     def scan(self, index: int) -> Scan:
-        """Read scan `index`; says so where its points break the rule. Raises InputError as the sequence does."""
+        """Read scan `index`; points that break the rule are named in its `fault`. Raises InputError as the sequence does."""
         scan = self.whole.scan(index)
         clock = next(clock for first, clock in reversed(self._clocks) if first <= index)
         if clock is None:
@@ -107,7 +107,10 @@ class WithoutClasses(SequenceView):
         self._is_dropped = table_of(names)
 
     def scan(self, index: int) -> Scan:
-        """Read scan `index` and leave points out; one without labels stays whole and says so. Raises InputError as before."""
+        """Read scan `index` and leave points out; one without labels stays whole, with a `fault`.
+
+        Raises InputError as the sequence does.
+        """
         scan = self.whole.scan(index)
         if scan.labels is None:
             why = "its points have no labels and none is left out"
@@ -202,7 +205,7 @@ class MergedLidars(SequenceView):
         return _join(scan, parts, self._is_timed)
 
     def with_rings(self, choice: str, is_strict: bool = True) -> Sequence:
-        """The same with the rings of each LiDAR found by itself; is_strict : as of `RingView`."""
+        """The merged sequence with the rings of each LiDAR found separately; is_strict : as of `RingView`."""
         others = [replace(other, scans=with_rings(other.scans, choice, is_strict)) for other in self.further_lidars]
         return MergedLidars(with_rings(self.whole, choice, is_strict), others)
 

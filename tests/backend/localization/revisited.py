@@ -51,7 +51,7 @@ def revisit(scenario: str, seed: int, visit: Visit, count: int) -> Revisited:
     store = KeyframeStore()
     with Keyframing(store, CONFIG) as keyframing:
         results = estimate(drive, create_odometry(CONFIG), threads=1, keyframing=keyframing)
-        keyframing.settle()
+        keyframing.finalise()
     return Revisited(town_map(scenario, seed), drive, results, store)
 
 

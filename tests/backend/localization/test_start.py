@@ -12,7 +12,7 @@ from turned_sensor import TURNS, turn, turned_pose, turned_store
 from lslam.backend.keyframes.store import KeyframeStore
 from lslam.backend.localization.locate import SPACING_M, PlaceFinder, Start, StartPrior, Vote
 from lslam.backend.localization.prior_map import PlaceSearch, Region, make_prior_map
-from lslam.backend.localization.sessions import Session, tie
+from lslam.backend.localization.sessions import Session, locate_session
 from lslam.backend.loops.level_submap import make_level_submap
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.geometry import se3, so3
@@ -185,7 +185,7 @@ def test_a_session_with_a_turned_sensor_is_tied_to_others(name: str, is_first: b
     R = turn(name)
     ways = (R, np.eye(3)) if is_first else (np.eye(3), R)
     known, other = part(world, 0, ways[0]), part(world, len(world.store) // 3, ways[1])
-    tied, why = tie(other, [known], CONFIG)
+    tied, why = locate_session(other, [known], CONFIG)
     assert tied is not None, why
     move, angle = error_of(tied.T_town_session, se3.make(R.T if is_first else R, np.zeros(3)))
     assert move < 0.1

@@ -75,7 +75,7 @@ def test_distorted_scans_become_straight_clouds_of_every_method(method: str, sha
     store = KeyframeStore()
     with Keyframing(store, config) as keyframing:
         estimate(with_rings(drive, "auto"), create_odometry(config), keyframing=keyframing)
-        keyframing.settle()
+        keyframing.finalise()
     assert [k.scan for k in store.keyframes[:3]] == [0, 2, 4]
     knots = np.linspace(0, 1, 33)
     for keyframe in store.keyframes[:3]:
@@ -100,7 +100,7 @@ def test_a_store_that_cannot_be_written_ends_the_run(tmp_path: Path, threads: in
     def use() -> None:
         with keyframing:
             keyframing.see(0, scan, ScanResult(0, 0, np.eye(4)), AT_ONCE)
-            keyframing.settle()
+            keyframing.finalise()
 
     with pytest.raises(OutputError, match="cannot be written"):
         use()

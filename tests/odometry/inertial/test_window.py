@@ -20,8 +20,8 @@ from lslam.odometry.inertial.window import (
     SHARED,
     Moment,
     Window,
-    loosen,
-    off_by,
+    add_random_walk,
+    pose_error,
 )
 
 Floats = NDArray[np.float64]
@@ -121,7 +121,7 @@ def test_the_factor_of_a_scan_includes_the_lever_arm() -> None:
     assert moment.equations is not None
 
     def cost(d: Floats) -> float:
-        e = off_by(true_pose(0.0) @ T_IMU_SCAN, moment.retract(d).T_world_lidar)
+        e = pose_error(true_pose(0.0) @ T_IMU_SCAN, moment.retract(d).T_world_lidar)
         return float(0.5 * e @ POINTS @ e)
 
     steps = 1e-6 * np.eye(EACH)
@@ -133,7 +133,7 @@ def test_a_walk_widens_the_covariance_of_what_walks_and_keeps_the_mean() -> None
     rng = np.random.default_rng(2)
     J = rng.normal(size=(30, 8))
     H, g = J.T @ J, rng.normal(size=8)
-    wider, gradient = loosen(H, g, slice(0, 3), 0.5)
+    wider, gradient = add_random_walk(H, g, slice(0, 3), 0.5)
     expected = np.linalg.inv(H) + np.diag(np.repeat([0.5, 0.0], [3, 5]))
     np.testing.assert_allclose(np.linalg.inv(wider), expected, atol=1e-10)
     np.testing.assert_allclose(np.linalg.solve(wider, gradient), np.linalg.solve(H, g), atol=1e-10)
