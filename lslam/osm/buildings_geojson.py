@@ -171,7 +171,7 @@ def corrected_osm(data: OsmData, corrected_map: CorrectedMap) -> OsmData:
         for number in ways:
             result.add_way(data.ways[number])
             result.nodes.update((node, data.nodes[node]) for node in data.ways[number].nodes)
-        for wish in _wishes(data, ways, correction, corrected_map.origin):
+        for wish in _node_targets(data, ways, correction, corrected_map.origin):
             wishes.setdefault(wish.node, []).append(wish)
         if name[0] == "relation":
             result.add_relation(data.relations[name[1]])
@@ -199,7 +199,7 @@ class _NodeTarget:
     confidence: float
 
 
-def _wishes(data: OsmData, ways: list[int], correction: BuildingCorrection, origin: Floats) -> list[_NodeTarget]:
+def _node_targets(data: OsmData, ways: list[int], correction: BuildingCorrection, origin: Floats) -> list[_NodeTarget]:
     """Position (m, local frame of `origin`) to which the correction moves each node of the building's `ways`."""
     nodes = list(dict.fromkeys(node for number in ways for node in data.ways[number].nodes))
     rotation, shift = about(correction.building.middle, correction.displacement)

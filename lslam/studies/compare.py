@@ -163,7 +163,10 @@ def _in_world_of_truth(
 
 
 def _turn_about_path(error: AbsoluteError, gt_positions: Floats) -> float:
-    """Uncertainty, rad, of the rotation about the path in an alignment of positions: rmse over the path's width."""
+    """Uncertainty, rad, of the rotation about the path in an alignment of positions: rmse over the path's width.
+
+    Infinite for a straight path, and without errors.
+    """
     width = np.linalg.svd(gt_positions - gt_positions.mean(axis=0), compute_uv=False)[1] / np.sqrt(len(gt_positions))
     return np.inf if error.translation is None or width == 0 else float(error.translation.rmse / width)
 
