@@ -64,7 +64,10 @@ def kitti_drift(estimate: Floats, truth: Floats) -> KittiDrift:
 
 
 def _segment_errors(estimate: Floats, truth: Floats, first: NDArray[np.intp], last: NDArray[np.intp]) -> Floats:
-    """(M, 2) translation m and rotation rad of inv(estimated motion) @ true motion."""
+    """(M, 2) translation m and rotation rad of inv(estimated motion) @ true motion, from pose `first` to pose `last` (M,).
+
+    estimate, truth : (N, 4, 4) matched poses
+    """
     true_motion = np.linalg.inv(truth[first]) @ truth[last]
     motion = np.linalg.inv(estimate[first]) @ estimate[last]
     E = np.linalg.inv(motion) @ true_motion

@@ -256,9 +256,10 @@ def _about_sensor(H: Floats, g: Floats, sweep: ElasticSweep, shares: Floats, cen
 
 
 def _to_ends_and_skew(H: Floats, g: Floats, shares: Floats) -> tuple[Floats, Floats]:
-    """(18, 18), (18,) of begin, end and the map's skew: `1 - share` of the first, `share` of the second move a part.
+    """Normal equations (18, 18), (18,) of begin pose, end pose and map skew, from the sums by parts H, g.
 
-    A map made of sweeps that lack the motion `skew` from begin to end shows a part too near by `share - 1/2` of it.
+    A part at `share` of the sweep moves with `1 - share` of the begin and `share` of the end. A map made of sweeps that lack the
+    motion `skew` from begin to end shows that part too near by `share - 1/2` of it.
     """
     weights = np.stack([1.0 - shares, shares, 0.5 - shares], axis=1)
     A = np.einsum("ka,kb,kij->aibj", weights, weights, H).reshape(18, 18)

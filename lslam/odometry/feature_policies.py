@@ -49,7 +49,10 @@ class AllPoints(Stateful):
         return icp.locate(prepare_points(attempt.points.cloud, icp.preprocess), attempt.T_prior)
 
     def confirm(self, attempt: Attempt, T_start: Floats, result: RegistrationResult) -> RegistrationResult:
-        """The result, unless many more non-ground points are inliers elsewhere: few rings slide along a road."""
+        """The result by features, or that of `icp` from `T_start` where many more non-ground points are inliers by that.
+
+        Few rings constrain features badly along a road.
+        """
         icp = self._of_recent(attempt.history)
         points = prepare_points(attempt.points.cloud, icp.preprocess)
         better = best_by_non_ground(icp.attempt(points, T_start), result)

@@ -57,7 +57,10 @@ class Landmarks:
         return Landmarks(self.anchors[which], self.lows[which], self.highs[which], self.unseen[which])
 
     def observe(self, which: Longs, lows: Floats, highs: Floats) -> Landmarks:
-        """The landmarks after a scan saw the planes `which` (K,), whose boxes grow to (K, 3), and missed all others."""
+        """The landmarks after a scan saw those with indices `which` (K,), and missed all others.
+
+        lows, highs : (K, 3) corners, m, world, to which their boxes grow
+        """
         low, high, unseen = self.lows.copy(), self.highs.copy(), self.unseen + 1
         np.minimum.at(low, which, lows)
         np.maximum.at(high, which, highs)
@@ -65,7 +68,7 @@ class Landmarks:
         return replace(self, lows=low, highs=high, unseen=unseen)
 
     def join(self, anchor: Floats, lows: Floats, highs: Floats) -> Landmarks:
-        """These and K new ones, with their boxes (K, 3), world, and a common anchor (4, 4)."""
+        """The landmarks and K new ones with a common anchor (4, 4); lows, highs : (K, 3) corners of their boxes, m, world."""
         return Landmarks(
             np.concatenate([self.anchors, np.broadcast_to(anchor, (len(lows), 4, 4))]),
             np.concatenate([self.lows, lows]),
@@ -125,7 +128,10 @@ class PlaneWindow:
     def with_sightings(
         self, planes: Longs, cp: Floats, information: Floats, lows: Floats, highs: Floats
     ) -> PlaneWindow:
-        """The newest state saw known `planes` (K,): closest points (K, 3), their information (K, 3, 3) and boxes (K, 3)."""
+        """The window in which the newest state saw the known planes with indices `planes` (K,).
+
+        cp, information : closest points (K, 3), m, LiDAR frame, and (K, 3, 3); lows, highs : (K, 3) corners of their boxes, world
+        """
         more = Sightings(np.full(len(planes), self.values.states - 1), planes, cp, information)
         return replace(self, sightings=self.sightings.join(more), landmarks=self.landmarks.observe(planes, lows, highs))
 

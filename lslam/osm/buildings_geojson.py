@@ -165,20 +165,20 @@ def corrected_osm(data: OsmData, corrected_map: CorrectedMap) -> OsmData:
     """
     owners = {_element(c.building): c for c in corrected_map.buildings}
     result = OsmData(attribution=corrected_map.attribution)
-    wishes: dict[int, list[_NodeTarget]] = {}
+    targets: dict[int, list[_NodeTarget]] = {}
     for name, correction in owners.items():
         ways = sorted(_ways_of(data, name))
         for number in ways:
             result.add_way(data.ways[number])
             result.nodes.update((node, data.nodes[node]) for node in data.ways[number].nodes)
-        for wish in _node_targets(data, ways, correction, corrected_map.origin):
-            wishes.setdefault(wish.node, []).append(wish)
+        for target in _node_targets(data, ways, correction, corrected_map.origin):
+            targets.setdefault(target.node, []).append(target)
         if name[0] == "relation":
             result.add_relation(data.relations[name[1]])
-    for node in _other_nodes(data, owners) & set(wishes):
-        was = wishes[node][0].was
-        wishes[node].append(_NodeTarget(node, (), was, was, np.inf))
-    _place(result, wishes, corrected_map.origin)
+    for node in _other_nodes(data, owners) & set(targets):
+        was = targets[node][0].was
+        targets[node].append(_NodeTarget(node, (), was, was, np.inf))
+    _place(result, targets, corrected_map.origin)
     numbers = (("node", list(result.nodes)), ("way", list(result.ways)), ("relation", list(result.relations)))
     kept = {(kind, number) for kind, those in numbers for number in those}
     result.versions = {key: version for key, version in data.versions.items() if key in kept}
@@ -210,10 +210,10 @@ def _node_targets(data: OsmData, ways: list[int], correction: BuildingCorrection
     ]
 
 
-def _place(result: OsmData, wishes: dict[int, list[_NodeTarget]], origin: Floats) -> None:
+def _place(result: OsmData, targets: dict[int, list[_NodeTarget]], origin: Floats) -> None:
     """Move the nodes of `result` to their targets; a node with targets in several places is split into new nodes."""
     fresh = iter(range(min([0, *result.nodes, *result.ways]) - 1, -(2**62), -1))
-    for node, wanted in wishes.items():
+    for node, wanted in targets.items():
         for group in _agreeing(sorted(wanted, key=lambda w: -w.confidence)):
             best = group[0]
             is_first = best is max(wanted, key=lambda w: w.confidence)
@@ -223,21 +223,21 @@ def _place(result: OsmData, wishes: dict[int, list[_NodeTarget]], origin: Floats
             lat, lon, _ = from_local(np.array([[*best.place, 0.0]]), origin)[0].tolist()
             result.add_node(number, round(lat, DECIMALS), round(lon, DECIMALS))
             result.edits.add(("node", number))
-            for way in [] if is_first else [way for wish in group for way in wish.ways]:
+            for way in [] if is_first else [way for target in group for way in target.ways]:
                 held = result.ways[way]
                 result.ways[way] = replace(held, nodes=tuple(number if n == node else n for n in held.nodes))
                 result.edits.add(("way", way))
 
 
-def _agreeing(wishes: list[_NodeTarget]) -> list[list[_NodeTarget]]:
+def _agreeing(targets: list[_NodeTarget]) -> list[list[_NodeTarget]]:
     """Groups of targets that lie within `ONE_NODE` m of the first target of the group."""
     groups: list[list[_NodeTarget]] = []
-    for wish in wishes:
-        near = [g for g in groups if np.linalg.norm(wish.place - g[0].place) <= ONE_NODE]
+    for target in targets:
+        near = [g for g in groups if np.linalg.norm(target.place - g[0].place) <= ONE_NODE]
         if near:
-            near[0].append(wish)
+            near[0].append(target)
         else:
-            groups.append([wish])
+            groups.append([target])
     return groups
 
 

@@ -141,7 +141,10 @@ def _alignments(one: Solid, ours: Floats, other: Solid, theirs: Floats) -> Itera
 
 
 def _touches(ours: Floats, theirs: Floats) -> Iterator[_Move]:
-    """Moves by translation alone that put the deepest corner on a wall; ours, theirs : walls (V, 2, 2), m."""
+    """Moves by translation alone, one per wall: the deepest corner of one building is put on a wall of the other.
+
+    ours, theirs : walls (V, 2, 2), m
+    """
     for side, corners, walls in ((0, ours[:, 0], theirs), (1, theirs[:, 0], ours)):
         for k, wall in enumerate(walls):
             u, length = _direction(wall)
@@ -163,7 +166,10 @@ def _move(
     contacts: tuple[tuple[int, int, int], ...],
     extra: float = 0.0,
 ) -> _Move:
-    """The move that takes our corners to `corners` + `push`."""
+    """The move that rotates our walls `ours` (V, 2, 2) by `rotation` (2, 2) and shifts their turned `corners` (V, 2) by `push`.
+
+    Its length is that of the farthest corner's way, m, plus `extra`.
+    """
     farthest = float(np.linalg.norm(corners + push - ours[:, 0], axis=1).max())
     return _Move(rotation, corners[0] + push - rotation @ ours[0, 0], farthest + extra, contacts)
 
@@ -286,7 +292,10 @@ def _constrain(
 def _group(
     members: list[int], middles: Floats, targets: Floats, information: Floats, contacts: list[Contact]
 ) -> Floats:
-    """Displacements (M, 3) of one group by Gauss-Newton; dense, since groups are small."""
+    """Displacements (M, 3) of buildings in contact, nearest to `targets` (M, 3) by `information`; dense Gauss-Newton.
+
+    members : their numbers; middles : (M, 2) m
+    """
     place = {m: k for k, m in enumerate(members)}
     moved = targets.copy()
     size = 3 * len(members)
@@ -311,7 +320,10 @@ def _group(
 def _residual(
     contact: Contact, owner_middle: Floats, owner_at: Floats, other_middle: Floats, other_at: Floats
 ) -> tuple[float, Floats, Floats]:
-    """Signed distance, m, of the displaced point from the displaced wall, positive outside, and its Jacobians (3,), (3,)."""
+    """Signed distance, m, of a contact's point from its wall, positive outside, and Jacobians (3,) by both displacements.
+
+    owner_at, other_at : displacements (3,) of the two buildings about their middles (2,), m
+    """
     R, shift = about(owner_middle, owner_at)
     point = R @ contact.point + shift
     R, shift = about(other_middle, other_at)

@@ -256,7 +256,11 @@ class OsmServer(OsmBuffer):
         self.ask(np.zeros(2))
 
     def see(self, stamp_ns: int, T_world_lidar: Floats) -> None:
-        """Request the buildings around a pose (4, 4) that odometry estimates, unless an earlier request covers them."""
+        """Request the buildings around the sensor, unless an earlier request covers them.
+
+        The place is the fix at `stamp_ns`, else the pose T_world_lidar by the configured heading. With neither, a circle about
+        the origin is requested that doubles with the distance from it.
+        """
         at = se2.of_se3(T_world_lidar)
         self._start = at if self._start is None else self._start
         step = se2.relative(self._start, at)

@@ -110,7 +110,10 @@ class OsmTrack:
         return np.asarray(H.T @ np.linalg.solve(own + H @ np.diag(variance) @ H.T, H))
 
     def _innovation(self, pose: Floats, information: Floats) -> tuple[Floats, Floats, Floats]:
-        """Innovation (R,) of a match, its Jacobian (R, 3) and the covariance (R, R), along the observed directions."""
+        """Innovation (R,) of a match with `pose` (3,), its Jacobian (R, 3) and the covariance (R, R) of match and map, without the track's.
+
+        Only the R directions that `information` (3, 3) observes count.
+        """
         H, own = _directions(information)
         away = np.asarray(pose, np.float64) - self.pose
         away[2] = se2.wrap(away[2])

@@ -294,7 +294,10 @@ def _standing(points: Floats, height: Floats) -> NDArray[np.uint16]:
 
 
 def _shapes(points: Floats, keys: Longs, member: Longs) -> tuple[Bools, Bools, Bools]:
-    """(V,) per voxel: is its neighbourhood a plane, is that plane vertical, and has it points but no plane."""
+    """(V,) per voxel of `keys`: is its neighbourhood a plane, is that plane vertical, and has it points but no plane.
+
+    member : (N,) voxel of each point
+    """
     relative = points - points.mean(0)
     moments = np.column_stack(
         [np.ones(len(points)), relative, *(relative[:, i] * relative[:, j] for i in range(3) for j in range(i, 3))]
@@ -333,7 +336,10 @@ def _things(cells: Longs) -> Longs:
 def _by_size(
     points: Floats, height: Floats, things: Longs, labels: NDArray[np.uint16], is_flat: Bools
 ) -> NDArray[np.uint16]:
-    """Classes of the points of low objects: vehicles and poles by their size, all others as in `labels`."""
+    """Classes (N,) of points (N, 3) lower than a vehicle's top: vehicles and poles by their object's size, else `labels` (N,).
+
+    height : (N,) m above ground; things : (N,) index of each point's object; is_flat : (N,) whether its voxel is a plane
+    """
     if not len(points):
         return labels
     count = np.bincount(things)

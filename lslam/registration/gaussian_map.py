@@ -230,7 +230,10 @@ def source_covariance(
 
 
 def _of_neighbours(source: Floats, map_points: NDArray[np.float32], thin: float) -> Floats:
-    """Discs (S, 6), m2, whose normals are those of the nearest points, of one ring or several, as in generalized ICP."""
+    """Discs (S, 6), m2, of source points (S, 3): variance `thin` along the normal of the nearest map points (M, 3).
+
+    These are of one ring or several, as in generalized ICP.
+    """
     from scipy.spatial import cKDTree
 
     cloud = map_points.astype(np.float64)

@@ -142,7 +142,10 @@ class LastKeyframes(MapScans):
         self.keyframes: list[tuple[Any, Floats]] = []
 
     def enter(self, target: Any, cloud: Any, T_world_lidar: Floats) -> None:
-        """Add a keyframe when it is due; the map is built anew when an old one leaves."""
+        """Insert `cloud` (points, LiDAR frame) into `target` as keyframe when it moved or turned enough since the last one.
+
+        When more than `count` are kept, the oldest is dropped and the map is built anew.
+        """
         if self.keyframes:
             step = se3.relative(self.keyframes[-1][1], T_world_lidar)
             if np.linalg.norm(step[:3, 3]) < self.move and float(so3.angle(step[:3, :3])) < self.turn:

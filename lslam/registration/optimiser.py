@@ -70,7 +70,7 @@ class Correspondences:
         self.distance2.fill(-1.0)
 
     def search(self, target: object = None) -> tuple[Any, ...]:
-        """The state of a residual's search in one map, see `kernels.linearisation`."""
+        """Arrays that a residual keeps of its search in one map, of type `Search` in `core.kernels.linearisation`."""
         if target not in self._looked_up:
             count = len(self)
             self._looked_up[target] = (*slots_of(count), np.empty((count, 2), np.int32), np.empty((count, 4)))
@@ -87,7 +87,7 @@ def slots_of(count: int) -> tuple[Longs, Ints]:
 
 @dataclass(frozen=True)
 class Term:
-    """A residual of some points on one map: its compiled `linearise` and what this takes, see `kernels.linearisation`."""
+    """A residual of some points on one map: its compiled `linearise` and what this takes, see `core.kernels.linearisation`."""
 
     linearise: Callable[..., None]
     points: tuple[Any, ...]

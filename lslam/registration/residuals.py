@@ -18,24 +18,27 @@ Arrays = tuple[Any, ...]
 
 
 def _alone(points: PreparedPoints, sigma: float) -> Arrays:
-    """The source points alone."""
+    """The source points (S, 3), m."""
     return (points.source,)
 
 
 def _with_scatter(points: PreparedPoints, sigma: float) -> Arrays:
-    """The source points and the scatter of the points behind each."""
+    """The source points (S, 3), m, and the covariance (S, 6), m2, of the raw points that each is the mean of."""
     return points.source, points.scatter
 
 
 def _with_gaps(points: PreparedPoints, sigma: float) -> Arrays:
-    """The source points and the gap between rings at each, m; 0 where it was not computed."""
+    """The source points (S, 3), m, and the gap (S,) between rings at each, m; 0 where it was not computed."""
     from numpy import zeros
 
     return points.source, zeros(len(points.source)) if points.gaps is None else points.gaps
 
 
 def _with_covariance(points: PreparedPoints, sigma: float) -> Arrays:
-    """The source points and the covariance of the surface at each, computed here if the points lack it."""
+    """The source points (S, 3), m, and the covariance (S, 6), m2, of the surface at each, computed here if the points lack it.
+
+    sigma : m, of a surface along its normal
+    """
     from lslam.registration.gaussian_map import source_covariance
 
     if points.covariance is not None:
@@ -69,7 +72,7 @@ NON_PLANAR_WEIGHT = 0.5
 class ResidualKind:
     """What one residual is.
 
-    module, function : its compiled `linearise`, see `kernels.linearisation`; imported when it is asked for
+    module, function : its compiled `linearise`, see `core.kernels.linearisation`; imported when it is asked for
     points : source points, and what it takes of each, by the noise of a point, m
     voxels : what it takes of a map
     by_surfaces : whether S of its sums tells which directions are observed: its matrices are full

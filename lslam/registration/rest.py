@@ -208,7 +208,7 @@ class Rest(Stateful):
         return float(np.linalg.norm(level[:3]) + np.linalg.norm(level[3:]) * lever_arm)
 
     def enter(self, cloud: NDArray[np.float32], T_world_lidar: Floats, lever_arm: float) -> None:
-        """Count one more scan at the spot, or begin a new spot with it: points (N, 3), m, LiDAR frame, and pose (4, 4)."""
+        """Count one more scan at the spot, or begin a new spot with it: cloud (N, 3), m, LiDAR frame; lever_arm : m."""
         away = self._away(T_world_lidar, lever_arm)
         if self._cloud is not None and away < self._reach:
             self.scans, self._squares = self.scans + 1, self._squares + away**2

@@ -76,7 +76,7 @@ class RegistrationResult:
     ) -> RegistrationResult:
         """The result of an iteration from `T_start` (4, 4) to `pose` (4, 4); a failed one at the start if `pose` is not finite.
 
-        H, facts, step : (6, 6), and sums of the points (`kernels.linearisation`), of the last linearisation, and (6,) its step
+        H, facts, step : (6, 6), and sums of the points (`core.kernels.linearisation`), of the last linearisation, and (6,) its step
         weak : (K, 6) unobserved directions
         """
         f = facts.tolist()
@@ -130,7 +130,10 @@ class RegistrationResult:
 
 
 def _covariance(H: Floats, weak: Floats, information: float, lever: float) -> Floats:
-    """Inverse of the information, with a sigma of one metre along degenerate directions."""
+    """Covariance (6, 6) by the inverse of H, with a sigma of at most one metre along degenerate directions, `weak` (D, 6).
+
+    lever : m, scales rotations to lengths; information : of all points, a floor of the eigenvalues is 1e-9 of it
+    """
     scale = np.array([1.0, 1.0, 1.0, 1 / lever, 1 / lever, 1 / lever])
     values, vectors = np.linalg.eigh(H * np.outer(scale, scale))
     values = np.maximum(values, 1e-9 * max(information, 1e-9))

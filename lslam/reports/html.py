@@ -80,7 +80,7 @@ def imu_figures(record: RunRecord) -> list[Figure]:
 
 
 def _course(course: _Course, seconds: Floats, values: Floats, sigmas: Floats) -> Figure:
-    """Figure of some IMU states over time, with bands."""
+    """Figure of IMU states over time, with bands; values, sigmas : (N, states) at `seconds` (N,)."""
     lines, reach = numbered_lines(course.names, seconds, values.T), BAND_SIGMAS * sigmas.T
     bands = [svg.Band(line.x, line.y - r, line.y + r, line.style) for line, r in zip(lines, reach, strict=True)]
     caption, legend = f"{course.recipe} Band: {BAND_SIGMAS:g} sigma.".strip(), None if len(lines) > 1 else ()

@@ -120,7 +120,7 @@ class Frame:
             self.add(f'<path class="band {band.style}" d="{around}Z"/>')
 
     def dot(self, px: float, py: float, style: str, radius: float = 4) -> None:
-        """Add a filled circle at SVG coordinates."""
+        """Add a filled circle about (px, py) with a radius, all in SVG units."""
         self.add(f'<circle class="dot {style}" cx="{px:.1f}" cy="{py:.1f}" r="{radius:g}"/>')
 
     def marks(self, x: NDArray[Any], style: str) -> None:

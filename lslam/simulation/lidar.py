@@ -298,7 +298,10 @@ def _into_city(
     period: float,
     times: Floats,
 ) -> Rays:
-    """Rays (N, 3) from the LiDAR's frame to the city frame, by one pose (4, 4) or a pose (columns, 4, 4) per column."""
+    """Rays (N, 3) of the LiDAR in the city frame, by one pose (4, 4) or a pose (columns, 4, 4) per column.
+
+    directions : (N, 3) unit vectors, LiDAR frame; period : s per turn; times : (columns,) s
+    """
     by_column = directions.reshape(model.columns, model.rings, 3)
     lift = np.outer(model.heights, [0, 0, 1]).astype(np.float32)
     R, t = poses[..., :3, :3].astype(np.float32), poses[..., :3, 3].astype(np.float32)

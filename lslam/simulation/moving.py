@@ -214,6 +214,6 @@ def _keeps_clear(body: Mover, times: Floats, ego: Floats) -> bool:
 
 
 def _limb(low: Floats, high: Floats, half: float) -> list[list[Floats]]:
-    """Four upright sides between two squares."""
+    """Four upright sides of a prism between squares of half width `half`, m, about the centres `low` and `high` (3,)."""
     square = half * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float64)
     return [[low + square[k], low + square[k - 3], high + square[k - 3], high + square[k]] for k in range(4)]

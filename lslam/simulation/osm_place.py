@@ -218,7 +218,10 @@ def _distances(buildings: Sequence[Building]) -> tuple[Floats, NDArray[np.float3
 
 
 def _free_shifts(line: Floats, low: Floats, distance: NDArray[np.float32], margin: float) -> tuple[Floats, Longs]:
-    """Shifts (M, 2) on a grid that keep `line` (N, 2) on free ground, and the number of its points within sight of walls."""
+    """Shifts (M, 2), m, on a grid that keep `line` (N, 2) `margin` m off buildings, and the points (M,) in sight of walls.
+
+    distance : (X, Y) m to the next building, from the corner `low` (2,) on
+    """
     size = DISTANCE_CELL_M * np.array(distance.shape)
     x, y = (np.arange(low[k], low[k] + size[k], SHIFT) for k in (0, 1))
     shifts = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)

@@ -138,7 +138,10 @@ def _as_arrays(
 def _linear(
     count: int, owners: NDArray[np.intp], measurements: Floats, weights: Floats, map_prior: MapPrior
 ) -> tuple[Floats, Floats, Floats]:
-    """Displacements (B, 3), covariances (B, 3, 3) and common shift (2,) by least squares; buildings are eliminated first."""
+    """Displacements (B, 3), covariances (B, 3, 3) and common shift (2,) of B = count buildings by linear least squares.
+
+    owners, measurements, weights : as of `_as_arrays`. The buildings are eliminated first.
+    """
     own = np.diag(1.0 / map_prior.sigma**2)
     normal, pull = np.tile(own, (count, 1, 1)), np.zeros((count, 3))
     np.add.at(normal, owners, weights)
@@ -159,7 +162,7 @@ def _linear(
 def _squared_residuals(
     solution: tuple[Floats, Floats, Floats], owners: NDArray[np.intp], measurements: Floats, weights: Floats
 ) -> Floats:
-    """(M,) whitened squared residuals of the matches."""
+    """(M,) whitened squared residuals of the matches; solution : as of `_linear`; others as of `_as_arrays`."""
     away = measurements - solution[0][owners]
     away[:, 2] = se2.wrap(away[:, 2])
     return np.asarray(np.einsum("mi,mij,mj->m", away, weights, away))
@@ -250,7 +253,10 @@ def _solution(
     inliers: Bools,
     map_prior: MapPrior | None,
 ) -> BuildingSolution:
-    """Displacements of all buildings; those without a match follow the shift of the others."""
+    """Displacements of all buildings with `middles` (B, 2), m; those without a match follow the mean shift of the others.
+
+    which : matched buildings; places, block_covariances : (W, 4, 4), (W, 6, 6) of their solved poses; inliers : of the matches
+    """
     solution = np.zeros((len(middles), 3))
     covariances = np.tile(np.diag(_sigma(map_prior, False) ** 2), (len(middles), 1, 1))
     if which:

@@ -126,6 +126,7 @@ def _of_fixes(
 ) -> float:
     """Drift factor by pairs of fixes, half the fixes apart: their displacement minus odometry's, along `dim` axes.
 
+    white, drift : (K, 6, 6) as of `chains`
     probability : of the median under the null hypothesis, below which the factor is 0
     """
     half = len(fixes) // 2

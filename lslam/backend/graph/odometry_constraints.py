@@ -81,7 +81,7 @@ def fitness_score(points: NDArray[np.float32], other: NDArray[np.float32], T: Fl
 def fitness_covariance(score: float, config: GraphConfig) -> Floats:
     """(6, 6) covariance of a registration from its fitness score, m2, as hdl_graph_slam has it.
 
-    The variance rises from that of the smaller of two sigmas to that of the larger with it.
+    The sigma is the first of `FITNESS_SIGMA_M` and of `FITNESS_SIGMA_RAD` at score 0, and the second from `fitness_limit` on.
     """
     limit = config.fitness_limit
     share = (1 - np.exp(-FITNESS_GAIN * min(score, limit))) / (1 - np.exp(-FITNESS_GAIN * limit))
@@ -168,9 +168,10 @@ def _covariance(
     drift: float,
     config: GraphConfig,
 ) -> Floats:
-    """(6, 6) of a scan's pose: its keyframe's covariance, odometry's growth between them, and its own registration.
+    """Covariance (6, 6) of a scan's pose: its keyframe's, the growth of odometry's between them, and its own registration's.
 
-    final, odometry : (4, 4) of the scan after and before the graph; pose, covariance : of the keyframe after it; drift : factor
+    final, odometry : poses (4, 4) of the scan after and before the graph
+    pose, covariance : of the keyframe after the graph; drift : factor on the covariance of odometry's drift
     """
     step = final[:3, 3] - pose[:3, 3]
     first, last = (keyframe, result) if keyframe.stamp_ns <= result.stamp_ns else (result, keyframe)

@@ -124,7 +124,10 @@ def solve_incrementally(factors: Any, values: Any, count: int) -> Any:
 
 @dataclass(frozen=True)
 class OutlierCandidate:
-    """A factor that may be an outlier: `make(scale, kernel)` gives it with its covariance times `scale`; dim of its residual."""
+    """A factor that may be an outlier; dim : of its residual.
+
+    make : function of a scale and gtsam's noise kernel that gives the factor with its covariance times the scale
+    """
 
     make: Callable[[float, Any], Any]
     dim: int

@@ -127,7 +127,7 @@ def copc_bytes(header: Any, record: Any, laszip_record: Any) -> io.BytesIO:
 
 
 def _pages(keys: Longs, begins: Longs, sizes: Longs, counts: NDArray[np.int64]) -> bytes:
-    """The nodes, with the place, the bytes and the points of their chunks."""
+    """Bytes of the hierarchy page: per node its key (4,), offset in the file, size in bytes and number of points."""
     kind = np.dtype([("key", "<i4", (4,)), ("offset", "<u8"), ("size", "<i4"), ("count", "<i4")])
     table = np.zeros(len(keys), kind)
     table["key"], table["count"] = keys, counts

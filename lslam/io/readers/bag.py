@@ -349,7 +349,10 @@ def truth_topics(bag: Bag) -> list[BagTopic]:
 
 
 def find_truth(sequence: BagSequence, links: Links, lidar: str, voice: Voice) -> Trajectory | None:
-    """LiDAR poses from the first topic named as ground truth (Odometry or PoseStamped), None when there is none."""
+    """LiDAR poses from the first topic named as ground truth (Odometry or PoseStamped), None when there is none.
+
+    Poses of a body without a static transform to the LiDAR are taken as the LiDAR's, with a problem.
+    """
     bag = sequence.bag
     topics = truth_topics(bag)
     if not topics:

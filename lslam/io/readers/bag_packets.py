@@ -76,7 +76,10 @@ def open_packets(bag: Bag, topic: BagTopic, voice: Voice) -> tuple[SpinningSenso
 
 
 def _gather(bag: Bag, topics: list[BagTopic], positions: tuple[int, ...], voice: Voice) -> tuple[BagPackets, str]:
-    """All packets of the topics, and first frame; damaged messages become problems. InputError without a packet."""
+    """All packets of the topics, and the first frame name; damaged messages become problems. InputError without a packet.
+
+    positions : of the bytes in each packet to keep in memory
+    """
     stamps, sizes, heads, places = [], [], [], []
     frame = ""
     for n, topic in enumerate(topics):

@@ -170,8 +170,8 @@ class OdometryCheckpoints:
     def begin(self, tracker: WindowTracker, keyframing: Keyframing) -> list[ScanResult]:
         """Restore tracker and keyframes from the newest checkpoint, and return its results; empty without one.
 
-        Where the store of keyframes lacks some of them, the run begins again, with a warning. Raises InputError for a checkpoint that
-        does not fit the tracker.
+        Where the store of keyframes lacks some of them, the run begins again, with a warning. Raises InputError for a checkpoint
+        that does not fit the tracker.
         """
         self._began = time.monotonic()
         latest = self._latest

@@ -37,7 +37,10 @@ class Course:
         self.instants_ns, self.poses = instants_ns[is_later], poses[is_later]
 
     def at(self, stamp_ns: int, times: Floats) -> Floats | None:
-        """(K, 4, 4) poses at `times` (K,) of a sweep, s from the stamp; None where the course has none in it, or too few."""
+        """Poses (K, 4, 4) at `times` (K,), s from the stamp, by the spline through the poses in a sweep and three on each side.
+
+        None where no pose lies within the sweep, the course has fewer than three, or K < 2.
+        """
         begin, end = stamp_ns + 1e9 * times[0], stamp_ns + 1e9 * times[-1]
         first, last = np.searchsorted(self.instants_ns, begin), np.searchsorted(self.instants_ns, end, side="right")
         if len(times) < 2 or len(self.instants_ns) < NEIGHBOUR_SWEEPS or first == last:

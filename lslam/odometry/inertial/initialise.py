@@ -154,7 +154,9 @@ def _refuse_sign(imu: ImuStream, T_lidar_imu: Floats, part: FirstPoses, gyro_bia
     bias, none = np.zeros(3) if gyro_bias is None else gyro_bias, np.zeros(3)
     guess = ImuEstimate(none, none, none, Gyroscope.of_bias(bias, MEAN_GYRO_BIAS), np.eye(9))
     as_given, reversed_ = (
-        _path_of_force(replace(imu, accel=sign * imu.accel), part.poses @ T_lidar_imu, part.stamps_ns, guess)[2]
+        _fit_velocity_and_gravity(
+            replace(imu, accel=sign * imu.accel), part.poses @ T_lidar_imu, part.stamps_ns, guess
+        )[2]
         for sign in (1.0, -1.0)
     )
     # Forces of the right sign miss the path farther nowhere where anything accelerates.
@@ -209,7 +211,7 @@ def _first_guess(
     covariance[DOWN, BIAS], covariance[BIAS, DOWN] = shared * R, shared * R.T
     gyroscope = Gyroscope.of_bias(gyro_bias, gyro_sigma, ImuNoise.of(config))
     guess = ImuEstimate(np.zeros(3), np.zeros(3), accel_bias, gyroscope, covariance)
-    gravity = _path_of_force(imu, part.poses @ T_lidar_imu, part.stamps_ns, guess)[1]
+    gravity = _fit_velocity_and_gravity(imu, part.poses @ T_lidar_imu, part.stamps_ns, guess)[1]
     return replace(guess, gravity=GRAVITY * gravity / max(float(np.linalg.norm(gravity)), 1e-9))
 
 
@@ -237,7 +239,9 @@ def _learn(
         learnt = learnt.correct(imu, step, R, R_end, T[k + 1, :3, 3] - T[k, :3, 3], gyroscope)
     covariance = learnt.covariance.copy()
     covariance[:3, :] = covariance[:, :3] = 0.0
-    velocity, _, spread = _path_of_force(imu, opening.poses @ T_lidar_imu, opening.stamps_ns, learnt, SPEED_S)
+    velocity, _, spread = _fit_velocity_and_gravity(
+        imu, opening.poses @ T_lidar_imu, opening.stamps_ns, learnt, SPEED_S
+    )
     sigma = max(spread, 0.1)
     if config.initial_velocity is not None:
         i = min(int(np.searchsorted(imu.stamps_ns, opening.stamps_ns[0])), len(imu) - 1)
@@ -247,12 +251,13 @@ def _learn(
     return replace(learnt, velocity=velocity, covariance=covariance)
 
 
-def _path_of_force(
+def _fit_velocity_and_gravity(
     imu: ImuStream, T_world_imu: Floats, stamps_ns: Longs, prior: ImuEstimate, seconds: float = np.inf
 ) -> tuple[Floats, Floats, float]:
-    """Velocity at the first pose (3,) and gravity (3,) that fit the poses of the first `seconds` best, and the velocity's sigma.
+    """Velocity (3,), m/s, at the first pose and gravity (3,), m/s2, in the world, and the velocity's sigma, m/s.
 
-    If `prior` has a gravity, that is kept and only the velocity is estimated.
+    They fit the poses T_world_imu (N, 4, 4) of the first `seconds` best. If `prior` has a gravity, that is kept. Fewer than four
+    poses give zero velocity with the sigma `ANY_SPEED`.
     """
     count = max(int(np.searchsorted(stamps_ns - stamps_ns[0], 1e9 * seconds)), min(4, len(stamps_ns)))
     has_gravity = bool(prior.gravity.any())

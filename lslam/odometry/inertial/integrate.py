@@ -113,7 +113,7 @@ def integrate(
 
 
 def _readings(imu: ImuStream, instants_ns: Longs) -> Floats:
-    """(K, 3) of the gyroscope at instants (K,), linear between samples and constant beyond them."""
+    """(K, 3) rad/s of the gyroscope at instants (K,), linear between samples and constant beyond them."""
     after = np.clip(np.searchsorted(imu.stamps_ns, instants_ns), 1, max(len(imu) - 1, 1))
     before, after = after - 1, np.minimum(after, len(imu) - 1)
     step = np.maximum(imu.stamps_ns[after] - imu.stamps_ns[before], 1)

@@ -160,7 +160,7 @@ def by_axis(along: float, across: float, direction: Floats) -> Floats:
 
 
 def squares_along(rest: Floats, C: Floats, direction: Floats) -> tuple[Floats, Floats]:
-    """Squares (3,) of an innovation (4,) along a unit vector, across it, the mean of both, and of the turn; those C expects."""
+    """Squares (3,) of an innovation `rest` (4,): along a unit vector, mean across, and of the turn; and those that C expects."""
 
     def parts(S: Floats) -> Floats:
         along = float(direction @ S[:3, :3] @ direction)

@@ -157,7 +157,10 @@ class IntegrityMonitor(Stateful):
         return 0.0
 
     def _compare(self, first: ReferenceScan, last: ReferenceScan, emptied_share: float) -> None:
-        """Test the motion of the poses between two scans."""
+        """Append the check of the motion claimed between two scans to `checks`, if a hypothesis has enough points to be judged.
+
+        emptied_share : as of `_empty_share`, stored with the check
+        """
         claimed = se3.relative(first.pose, last.pose)
         seconds = (last.stamp_ns - first.stamp_ns) * 1e-9
         pair = self._pair

@@ -77,7 +77,7 @@ def follow(
 def cut_rings(
     angles: Floats, slope: NDArray[np.float32], seam: float
 ) -> tuple[NDArray[np.uint16], Floats, NDArray[np.int64]]:
-    """Ring (N,) of each point, counted from 0: a new ring begins whenever the angle `turned` (N,), rad, passes the `seam`, rad.
+    """Ring (N,) of each point, counted from 0: a new ring begins whenever `angles` (N,), rad, unwrapped, pass the `seam`, rad.
 
     Returns also the mean slope (rings,) of each ring, and the number of its points with a slope (rings,).
     """

@@ -226,9 +226,9 @@ def _source_points(
     config: PreprocessConfig,
     index: int,
 ) -> Down:
-    """Source points, times and scatter as `config.downsample` says: from the map points' centroids, or from raw points.
+    """Source points (S, 3), m, their times and scatter (S, 6), m2, by `config.downsample`.
 
-    index : of the scan, seeds the random choice
+    Centroids are of `map_points`, the thinned scan; chosen points are of `cloud`, the raw scan. index : of the scan, a seed
     """
     if config.downsample == "target":
         return _target_count(map_points, map_times, config)
@@ -246,7 +246,7 @@ def _source_points(
 
 
 def _target_count(map_points: NDArray[np.float32], map_times: NDArray[np.float32], config: PreprocessConfig) -> Down:
-    """Centroids of a grid whose size gives a count between the limits, where the scan has so many points.
+    """Centroids, times and scatter of `map_points` in a grid whose size gives a count between the limits, if there are so many.
 
     Surfaces fill a grid with the inverse square of its size. The search starts afresh for each scan, so that a scan's
     points depend on this scan alone.

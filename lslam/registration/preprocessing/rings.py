@@ -85,7 +85,7 @@ def decide_rings(scans: list[Scan], choice: str = "auto", beams: int | None = No
 
     Raises
     ------
-    UsageError : `wanted` is none of these. InputError : the scans do not have such rings, or none at all.
+    UsageError : `choice` is none of these. InputError : the scans do not have such rings, or none at all.
     """
     kind, count = parse_rings(choice)
     # The end of a sweep, which a driver may begin with, says nothing of its order.

@@ -15,7 +15,7 @@ from lslam.odometry.inertial.agreement import check_agreement
 from lslam.odometry.inertial.gyroscope import INNOVATION_SIGMAS, Gyroscope
 from lslam.odometry.inertial.imu_cleaning import ImuRefusedError, clean
 from lslam.odometry.inertial.imu_estimate import ImuEstimate
-from lslam.odometry.inertial.initialise import FirstPoses, _is_static, _path_of_force
+from lslam.odometry.inertial.initialise import FirstPoses, _fit_velocity_and_gravity, _is_static
 from lslam.odometry.kernels import kalman
 from lslam.pipeline.doctor import Findings
 from lslam.pipeline.doctor.examine_imu import examine_imu
@@ -142,7 +142,7 @@ def test_the_sigma_of_the_first_velocity_follows_the_noise_of_the_scans() -> Non
     for _ in range(200):
         noise = 0.2 * rng.normal(size=(31, 3))
         poses = se3.make(np.tile(np.eye(3), (31, 1, 1)), noise - noise[0])
-        velocity, _, sigma = _path_of_force(imu, poses, SCAN_NS * np.arange(31), known, 3.0)
+        velocity, _, sigma = _fit_velocity_and_gravity(imu, poses, SCAN_NS * np.arange(31), known, 3.0)
         # Where the first place lies is taken as known: what it is wrong by is no noise of the path.
         t = 0.1 * np.arange(30)
         found.append((np.linalg.norm(velocity + (t.sum() / (t @ t)) * noise[0]), sigma))
@@ -162,7 +162,7 @@ def test_the_first_velocity_is_that_of_the_first_scans_alone(scan_ns: int, used:
     poses[:, 0, 3] = 3e-9 * scans
     for spoilt, is_right in ((used, True), (used - 1, False)):
         poses[spoilt:, 1, 3] = 0.5
-        velocity, _, sigma = _path_of_force(imu, poses, scans, known, 0.8)
+        velocity, _, sigma = _fit_velocity_and_gravity(imu, poses, scans, known, 0.8)
         assert (np.abs(velocity - [3.0, 0.0, 0.0]).max() < 1e-6) == is_right
         assert (sigma < 1e-6) == is_right
 
