@@ -221,7 +221,10 @@ class _Sightings:
 
 
 def _sightings(sweep: SweptPoints, flatness: float) -> _Sightings | None:
-    """Sightings of the planes that the points of `sweep` lie on; None when there is no plane."""
+    """Sightings of the planes that the points of `sweep` lie on; None when there is no plane.
+
+    flatness : as of `find_planes`
+    """
     planes = find_planes(sweep.points, sweep.poses, flatness)
     order = np.flatnonzero(planes >= 0)
     if not len(order):

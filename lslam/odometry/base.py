@@ -134,7 +134,7 @@ class AligningMethod(Traits):
 
     @abstractmethod
     def enter(self, prepared: Any, result: ScanResult) -> None:
-        """Learn from a scan, whether its alignment was accepted or not."""
+        """Learn from a scan with its `prepared` points, whether its alignment was accepted or not."""
 
     def register(self, scan: Scan, prepared: Any, prior: MotionPrior) -> ScanResult:
         """Align the scan, judge and enter it; `bridged` by the prior where it is rejected."""

@@ -110,9 +110,9 @@ class OsmTrack:
         return np.asarray(H.T @ np.linalg.solve(own + H @ np.diag(variance) @ H.T, H))
 
     def _innovation(self, pose: Floats, information: Floats) -> tuple[Floats, Floats, Floats]:
-        """Innovation (R,) of a match with `pose` (3,), its Jacobian (R, 3) and the covariance (R, R) of match and map, without the track's.
+        """Innovation (R,) of a match at `pose` (3,), its Jacobian (R, 3) and the covariance (R, R) of match and map.
 
-        Only the R directions that `information` (3, 3) observes count.
+        The track's own covariance is not in it. R directions are observed, as `information` (3, 3) says.
         """
         H, own = _directions(information)
         away = np.asarray(pose, np.float64) - self.pose

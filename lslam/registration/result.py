@@ -76,7 +76,7 @@ class RegistrationResult:
     ) -> RegistrationResult:
         """The result of an iteration from `T_start` (4, 4) to `pose` (4, 4); a failed one at the start if `pose` is not finite.
 
-        H, facts, step : (6, 6), and sums of the points (`core.kernels.linearisation`), of the last linearisation, and (6,) its step
+        H, facts : (6, 6), and sums of the points (`core.kernels.linearisation`), of the last linearisation; step : (6,) its step
         weak : (K, 6) unobserved directions
         """
         f = facts.tolist()

@@ -173,7 +173,10 @@ class KeyframeStore(Stateful):
         return self.folder / f"{file:06d}.npz"
 
     def _keep(self, file: int, cloud: Points, labels: Labels | None) -> tuple[Points, Labels | None]:
-        """Put a cloud, now read-only, into the cache, which drops the least recently used ones; returns cloud and labels."""
+        """Put the cloud of `file`, now read-only, into the cache, and return cloud and labels.
+
+        The least recently used clouds are dropped.
+        """
         cloud.flags.writeable = False
         with self._lock:
             self._recent[file] = cloud, labels

@@ -59,4 +59,7 @@ class PlaceDescriptor(Protocol):
         """Describe the cloud (N, 3), m, round keyframe `number`, level with z up; keyframes come once, in any order."""
 
     def nearest(self, number: int, others: Longs, turn: float = math.pi) -> list[PlaceMatch]:
-        """Matches of keyframe `number` among the keyframes `others`, the most similar first; all must have been added."""
+        """Matches of keyframe `number` among the keyframes `others`, the most similar first; all must have been added.
+
+        turn : rad, largest difference of their headings
+        """

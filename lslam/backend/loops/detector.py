@@ -289,7 +289,10 @@ class Detector:
     def _candidate(
         self, a: int, b: int, check: Verification, descriptor_distance: float = float("nan"), is_binding: bool = False
     ) -> LoopCandidate:
-        """The candidate of keyframes a and b with the verdict of a verification."""
+        """The candidate of keyframes a and b with the verdict of a verification.
+
+        is_binding : its loop closure is never an outlier candidate
+        """
         verdict = Verdict.REJECTED if check.reason else Verdict.ACCEPTED
         verdict_facts = (verdict, check.stage, check.reason, check.rmse, check.overlap)
         constraint = self._constraint(a, b, check, is_binding)
@@ -335,7 +338,7 @@ class Detector:
         return ""
 
     def _constraint(self, a: int, b: int, check: Verification, is_binding: bool = False) -> Constraint | None:
-        """Pose and covariance of the loop closure, from level axes to those of the keyframes."""
+        """Loop closure: pose of b in a and covariance, from level axes to those of the keyframes; None if undetermined."""
         if check.T_a_b is None or check.covariance is None:
             return None
         R_a, R_b = (self.keyframes[k].T_world_lidar[:3, :3] for k in (a, b))

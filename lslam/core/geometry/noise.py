@@ -28,7 +28,7 @@ def to_body(covariance: NDArray[Any], T: NDArray[Any]) -> Floats:
 
 
 def from_body(covariance: NDArray[Any], T: NDArray[Any]) -> Floats:
-    """The inverse of `to_body`."""
+    """The inverse of `to_body`: covariances in gtsam's order and body axes, with translation first in world axes."""
     J = np.swapaxes(into_body(T), -1, -2)  # orthogonal: the transpose is the inverse
     return np.asarray(J @ np.asarray(covariance, np.float64) @ np.swapaxes(J, -1, -2))
 

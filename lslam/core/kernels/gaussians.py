@@ -116,6 +116,7 @@ def _refresh(
     the sensor has moved: they reflect the scan pattern, not a surface. A voxel of such points is `EMPTY`. A voxel is valid when
     the variance of its points across the beams is at least `breadth` times that of the surface and the floor. Beams of several
     rings differ in elevation: then `RINGS_BREADTH` times the variance of the surface is enough.
+    size : m; the rest as in the module's header
     """
     s = moments[slot]
     n = s[0]

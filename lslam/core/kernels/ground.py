@@ -16,7 +16,10 @@ NO_HEIGHT = 1e30
 
 @inline
 def cell_of(x: float, y: float, inverse: float, half: int) -> int:
-    """Flat index of the cell a level point lies in, or -1 outside the grid."""
+    """Flat index, or -1, of the cell of a point x, y, m, in a grid of (2 half)^2 cells round the origin.
+
+    inverse : 1/m, of a cell's size
+    """
     i, j = int(np.floor(x * inverse)) + half, int(np.floor(y * inverse)) + half
     return i * 2 * half + j if 0 <= i < 2 * half and 0 <= j < 2 * half else -1
 

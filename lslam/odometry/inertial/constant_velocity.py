@@ -91,7 +91,10 @@ class MotionModel(Protocol):
     def correct(
         self, stamp_ns: int, pose: Floats, prior: MotionPrior | None = None, has_registration: bool = True
     ) -> None:
-        """Update with the pose (4, 4) found at `stamp_ns`; `prior` is the motion of its sweep."""
+        """Update with the pose (4, 4) found at `stamp_ns`; `prior` is the motion of its sweep.
+
+        has_registration : whether the pose is registered, not predicted
+        """
         ...
 
     def rewind(self, stamp_ns: int, pose: Floats, span: Span) -> MotionPrior:

@@ -272,7 +272,10 @@ class Window:
 
 @lru_cache(maxsize=64)
 def imu_information(nanoseconds: int, rate_variance: float, noise: ImuNoise) -> Floats:
-    """(15, 15) information of an IMU factor over so many nanoseconds: the inverse of its process noise; a read-only array."""
+    """(15, 15) information of an IMU factor over so many nanoseconds: the inverse of its process noise; a read-only array.
+
+    rate_variance : as of `process_noise`
+    """
     W = np.linalg.inv(process_noise(1e-9 * nanoseconds, rate_variance, noise)[np.ix_(OWN, OWN)])
     W.flags.writeable = False
     return W

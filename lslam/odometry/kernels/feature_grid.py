@@ -96,7 +96,8 @@ def nearest(
     """Index of the point of the grid that is nearest to x, y, z and less than `limit`, m, away, and its squared distance, m2.
 
     The index is -1 when there is none. The third value is the squared distance, m2, of the second nearest, `limit`^2 at most.
-    nearby : -1 allows every ring, 0 only `ring` and not the point `skipped`, n > 0 other rings that differ by n at most
+    size : m, of a cell; own : index of a point that does not count
+    nearby : -1 allows every ring, 0 only `ring`, without `own`, n > 0 other rings that differ by n at most
     """
     inverse = 1.0 / size
     best, best_d, next_d = -1, limit * limit, limit * limit

@@ -46,9 +46,10 @@ def _add_point(
     variance: float,
     c2: float,
 ) -> None:
-    """Add a point-to-point residual e (m) to H and g.
+    """Add a point-to-point residual (ex, ey, ez), m, to H and g.
 
-    r : m, point relative to the sensor; variance : m2, of e along each axis; c2 : m2, squared width of Geman-McClure
+    (rx, ry, rz) : m, point seen from the sensor, world axes; variance : m2, of the residual along each axis
+    c2 : m2, squared width of Geman-McClure
     """
     d2 = ex * ex + ey * ey + ez * ez
     robust = weigh_match(facts, d2, c2, np.inf)

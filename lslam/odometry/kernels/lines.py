@@ -94,8 +94,9 @@ def add_line(
 ) -> None:
     """Point to line, equation 2.24 of Girolimetto, squared: (I - u u^T) e has two components across the unit direction u.
 
-    `e` goes from a point of the line to the transformed point, `r` is that point seen from the sensor, world axes.
-    Geman-McClure weight of squared width `c2`; upper triangle of H.
+    e = (ex, ey, ez) goes from a point of the line to the transformed point, m; r = (rx, ry, rz) is that point seen from the
+    sensor, world axes; variance : m2, along each component.
+    Geman-McClure weight of squared width `c2`, m2; upper triangle of H.
     """
     along = ex * ux + ey * uy + ez * uz
     ex, ey, ez = ex - along * ux, ey - along * uy, ez - along * uz

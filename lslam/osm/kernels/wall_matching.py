@@ -165,6 +165,7 @@ def line_distance(
 
     Del Tufo, section 3.3.4 and figure 3.8. Without coverage: mean distance of both ends from the target segment. With
     coverage: mean distance from the target's line over the part where both lie side by side.
+    farthest : m, largest distance of a pair
     likeness : least cosine between the directions; outside and inside of a wall have opposite directions
     """
     ux, uy = target[2] - target[0], target[3] - target[1]

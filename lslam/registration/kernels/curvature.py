@@ -26,7 +26,10 @@ _BINS = round(2 * WIDEST_STEP / _BIN)
 def into_rings(
     rings: NDArray[np.uint16], chosen_points: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Order (K,) of the `chosen_points` by ring, in their own order within each, and starts (max ring + 2,)."""
+    """Order (K,) of the `chosen_points` by ring, in their own order within each, and where each ring starts in it.
+
+    The starts (max ring + 2,) end with K.
+    """
     count = np.int64(0)
     for i in chosen_points:
         ring = np.int64(rings[i])
@@ -50,7 +53,7 @@ def into_rings(
 def walk(
     points: NDArray[np.float32], order: NDArray[np.int64], starts: NDArray[np.int64]
 ) -> tuple[Floats, Floats, Floats, float, float, float]:
-    """Walk along every ring.
+    """Walk along every ring: points `order[starts[k]:starts[k + 1]]` are those of ring k.
 
     Returns the points in order (K, 3), their ranges (K,), m, and the angle to the next point of the ring (K,), rad, inf
     after the last; the median of that angle in steps of 0.01 deg (inf beyond 4 deg); the share of points at which

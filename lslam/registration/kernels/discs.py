@@ -37,6 +37,7 @@ def source_discs(
     """Write the discs, covariances (S, 6), m2, of the source points in plane voxels of their own scan to `out`.
 
     Returns the number of such points. Rows of the other points are not changed.
+    size : m, of a voxel; thin : m2, variance along the normal
     """
     inverse = 1.0 / size
     count = 0

@@ -16,7 +16,10 @@ _REACH = 2  # pixels without a return that neighbours may have between them
 
 @kernel
 def row_slopes(points: Floats, starts: NDArray[np.int64]) -> Floats:
-    """Mean tangent of elevation (rings,) of points (K, 3) in ring order, NaN for rings without points."""
+    """Mean tangent of elevation (rings,) of points (K, 3) in ring order, NaN for rings without points.
+
+    starts : (rings + 1,) where each ring starts in them
+    """
     slopes = np.full(starts.shape[0] - 1, np.nan)
     for k in range(slopes.shape[0]):
         total = 0.0

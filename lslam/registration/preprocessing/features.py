@@ -204,7 +204,10 @@ def _spin_axis(directions: Floats, starts: Longs) -> Floats:
 
 
 def gather_features(scan: Scan, walk: RingWalk, labels: NDArray[np.int8], grid_step: float) -> Features:
-    """The features of a scan with rings, as the walk along them is labelled (K,)."""
+    """The features of a scan with rings, as the walk along them is labelled (K,).
+
+    grid_step : m, of the cells that thin less planar points; 0 keeps all
+    """
     assert scan.rings is not None
     rings, times = scan.rings[walk.order], None if scan.times is None else scan.times[walk.order]
 
@@ -231,7 +234,10 @@ def _thin(
     times: NDArray[np.float32] | None,
     grid_step: float,
 ) -> FeaturePoints:
-    """The points of the `mask` (N,), or, for a `grid_step` above 0, m, their centroids in cells of it, ring by ring."""
+    """The points of the `mask` (K,) along the walk, or, for a `grid_step` above 0, m, their centroids ring by ring.
+
+    rings, times : (K,) of the walk's points
+    """
     at = np.flatnonzero(mask)
     if grid_step == 0:
         return FeaturePoints(walk.points[at], rings[at], None if times is None else times[at])

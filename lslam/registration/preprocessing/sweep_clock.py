@@ -257,7 +257,7 @@ def even_begin(points: NDArray[Any], shares: Floats, sense: int) -> float | None
 
 
 def _share_of_turn(angle: Floats, begin_rad: float, sense: int) -> Floats:
-    """Shares of a turn (N,), 0 to 1, from `begin_rad` to each angle (N,), rad."""
+    """Shares of a turn (N,), 0 to 1, from `begin_rad` to each angle (N,), rad; sense : 1 counter-clockwise, -1 clockwise."""
     return np.asarray(np.mod((angle - begin_rad) * (sense / _FULL), 1.0))
 
 
