@@ -14,7 +14,7 @@ Bytes = NDArray[np.uint8]
 
 @kernel
 def decompress(source: Bytes, target: Bytes) -> Any:
-    """Decompress `source` into `target`; returns the bytes written, -1 when `source` is broken or `target` too small."""
+    """Decompress LZF bytes `source` into `target`; returns the bytes written, -1 if `source` is broken or `target` too small."""
     i: Any = np.int64(0)
     o: Any = np.int64(0)
     n, m = np.int64(source.shape[0]), np.int64(target.shape[0])

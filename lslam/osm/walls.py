@@ -81,6 +81,7 @@ def find_walls(
 ) -> Walls:
     """Extract walls from the points (N, 3), m, of a scan or of a submap, in a frame whose z points up.
 
+    Points farther than `WALL_RANGE_M` along x or y count for nothing.
     is_wall : (N,) points that may be of walls; the others serve to find the ground
     views : (V, 2) or (V, 3) positions of the sensor, m, which direct the walls; the origin by default
     The same input gives the same result, which is empty without walls.

@@ -134,7 +134,7 @@ def heading_change(a: Floats, b: Floats, weights: Floats) -> float:
 
 
 def _robust_sigma(residuals: Floats) -> float:
-    """m; sigma of residuals (N, 2), outliers aside."""
+    """Sigma, m, of residuals (N, 2), m, by their median; 0.1 mm at least, and 1 m where none is finite."""
     ok = np.isfinite(residuals).all(1)
     return max(float(MAD * np.median(np.abs(residuals[ok]))), 1e-4) if ok.any() else 1.0
 

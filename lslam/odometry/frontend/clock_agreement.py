@@ -213,7 +213,7 @@ def _thin(count: int, most: int) -> Longs:
 
 
 def _distances(scans: list[_ScanAtPose]) -> Floats:
-    """(S,) mean of the bounded distances of each scan's points from the surfaces that the other scans make."""
+    """(S,) mean bounded squared distance (0 to 1) of each scan's kept-out points from the surfaces that the other scans make."""
     from scipy.spatial import cKDTree
 
     cloud = np.concatenate([scan.surface for scan in scans])

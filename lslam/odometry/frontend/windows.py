@@ -329,7 +329,10 @@ class WindowTracker(Stateful):
         return len({track.result.segment for track in self._decided}) == 1
 
     def _is_bent(self) -> bool:
-        """Whether the window's course, in one segment, displaces the points of most sweeps by more than their noise."""
+        """Whether the window's course displaces the points of most sweeps by more than their noise.
+
+        False where the track broke within the window, or for too few sweeps to tell.
+        """
         if not self._is_whole() or len(self._middles()) < 2 * NEIGHBOUR_SWEEPS:
             return False
         course = self._course()
