@@ -119,7 +119,7 @@ class Resumable(Traits, Protocol):
         ...
 
     def restore(self, state: State) -> None:
-        """Go on where `state` was taken, in an object made by the same configuration."""
+        """Set all that `state` gave, in an object made by the same configuration."""
         ...
 
 

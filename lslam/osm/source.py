@@ -57,7 +57,7 @@ class OsmSource(Protocol):
         """Start of a run; replies are written to `folder`."""
 
     def see(self, stamp_ns: int, T_world_lidar: Floats) -> None:
-        """Take the estimate (4, 4) of odometry at a stamp, ns; returns at once."""
+        """Use odometry's pose (4, 4) at a stamp, ns, where buildings are requested round it; returns at once."""
 
     def extract(self, origin: Floats) -> BuildingExtract:
         """The buildings in the local frame at `origin` (3,) lat, lon (deg), height (m)."""
@@ -210,7 +210,7 @@ class OsmBuffer:
                 raise InputError(f"{path} is no reply kept by an earlier run ({error}): remove it") from None
 
     def _collect(self) -> None:
-        """Take all finished requests."""
+        """Close all requests that are finished and keep their replies, as `_take`."""
         while not self._done.empty():
             self._take(self._done.get())
 
@@ -367,7 +367,10 @@ def open_osm(sequence: Sequence, config: Config) -> OsmSource | None:
 
 
 def extract_digest(config: OsmConfig) -> str:
-    """Digest of the file's bytes, for the identity of a run; empty without a file. Raises InputError when it is unreadable."""
+    """Digest of the bytes of the extract, a file or a folder of replies, for the identity of a run.
+
+    Without an extract, or with `auto`, that setting itself. Raises InputError for an unreadable file.
+    """
     if config.extract in ("", AUTO):
         return config.extract
     path = Path(config.extract)

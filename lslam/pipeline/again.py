@@ -126,7 +126,10 @@ def other_programs(recipe: Recipe) -> list[str]:
 
 
 def other_recording(recipe: Recipe, recording: Sequence, truth: Trajectory | None) -> list[str]:
-    """A sentence where the recording's files differ from those of the run, by sizes and times, before all is read; or none."""
+    """A sentence, or none, where the recording's files differ from those of the run by sizes and times, before all is read.
+
+    For a recording read from another place the sentence says that this is unknown.
+    """
     if recipe.is_elsewhere:
         return [
             f"the recording is read from {recipe.path}, not from {recipe.manifest['sequence']['path']}: whether its files are "

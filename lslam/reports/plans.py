@@ -259,7 +259,7 @@ def _draw_scale(figure: Any, plan: ScenePlan, below: int, letter: float) -> None
 
 
 def _legend_rows(figure: Any, names: list[Any], width: int, letter: float) -> list[list[Any]]:
-    """Legend entries (name, colour, kind of mark, position) in rows no wider than the plan."""
+    """Legend entries (name, colour, kind of mark, position) in rows no wider than `width` pixels; letter : px, of a letter."""
     rows: list[list[Any]] = [[]]
     x = 0.5 * letter
     for name, colour, kind in names:

@@ -153,6 +153,7 @@ def _cycle_errors(
 ) -> tuple[Floats, Floats]:
     """(P,) squared Mahalanobis distances of the cycle a_i -> b_i -> b_j -> a_j -> a_i from the identity.
 
+    i, j : (P,) indices of the two loop closures in `ends`
     The second array (P,) is the inverse variance, 1/m2, of drift in the cycle, which says how strict each test is.
     """
     ahead = se3.relative(graph.poses[ends.b[i]], graph.poses[ends.b[j]])

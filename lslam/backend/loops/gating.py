@@ -135,7 +135,7 @@ class LoopThrottle:
         return distance - self._tried_at >= self.wait
 
     def observe(self, distance: float, verdict: Verdict) -> None:
-        """Take the verdict of an attempt at `distance` m."""
+        """Count an attempt at `distance` m by its verdict."""
         self._row = self._row + 1 if verdict == self.last else 1
         self._tried_at, self.last = distance, verdict
 

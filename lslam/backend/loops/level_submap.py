@@ -233,10 +233,10 @@ class BestShifts:
         self.score, self.heading = np.zeros((2, len(cells)), np.float32)
 
     def observe(self, sums: Image, least: float, heading: float) -> None:
-        """Take the correlations (3, size, size) of another heading.
+        """Keep the score of each shift at another heading where it is the best so far, from three correlations (3, size, size).
 
-        sums : structure of a times that of b; where a observed, its square of b; where b observed, its square of a
-        least : of the second, below which the score is 0
+        sums : both images' structure; cells that a observed with b's squares; cells that b observed with a's squares
+        least : value of the second sum below which the score is 0
         """
         flat = sums.reshape(3, -1)
         bev.improve(flat, self.cells, np.float32(least), np.float32(heading), self.score, self.heading)

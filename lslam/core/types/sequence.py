@@ -168,7 +168,7 @@ class SequenceView(Scans):
         return len(self.whole)
 
     def scan(self, index: int) -> Scan:
-        """Read scan `index` of the whole sequence. Raises InputError as it does."""
+        """Read scan `index` of the whole sequence, with the errors of its `scan`."""
         return self.whole.scan(index)
 
 

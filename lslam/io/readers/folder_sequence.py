@@ -131,7 +131,10 @@ class Folder:
         return open_clock(list(samples.values()), rate_hz, self.info, self.voice.notes, self.voice.problems)
 
     def truth(self, path: Path | None, stamps: Longs) -> Trajectory | None:
-        """Poses in a file, of the stated body, else of the body that the file names."""
+        """Poses in the file `path`, of the stated body, else of the body that the file names; None without a file.
+
+        stamps : ns, of the scans, for rows without a time; an unreadable file is a problem, and None
+        """
         truth = None if path is None else load_poses(path, stamps, self.files, self.voice)
         return None if truth is None else replace(truth, frame=self.info.ground_truth_frame or truth.frame)
 

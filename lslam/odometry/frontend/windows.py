@@ -160,7 +160,7 @@ class WindowTracker(Stateful):
         return bool(self._scans) or self._tracker.is_complete
 
     def open(self, entry: ScanInput | None) -> None:
-        """Take the next scan, None at the end, into the window that is open or begins with it, before it is tracked."""
+        """Add the next scan, None at the end, to the open window, or begin a window with it if one is due. Tracking follows."""
         if not self._scans:
             if not self._is_begin(entry):
                 return

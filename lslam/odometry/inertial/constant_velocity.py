@@ -106,7 +106,7 @@ class MotionModel(Protocol):
         ...
 
     def restore(self, state: State) -> None:
-        """Go on where `state` was taken."""
+        """Set all that `state` gave."""
         ...
 
     @property

@@ -196,7 +196,10 @@ class MergedLidars(SequenceView):
             )
 
     def scan(self, index: int) -> Scan:
-        """Read scan `index` of the leading LiDAR and the points of the others that belong to it. Raises InputError as it does."""
+        """Read scan `index` of the leading LiDAR and the points of the others that belong to it.
+
+        Raises InputError when it is unreadable.
+        """
         scan = self.whole.scan(index)
         times = np.zeros(len(scan), np.float32) if scan.times is None and self._is_timed else scan.times
         parts = [replace(scan, times=times, lidars=np.zeros(len(scan), np.uint8))]
