@@ -14,7 +14,7 @@ from lslam.core.arrays import Floats
 from lslam.core.errors import InputError
 from lslam.core.kernels import gaussians
 from lslam.core.types.state import State, Stateful
-from lslam.registration.kernels.discs import EXTENT_M2, source_discs
+from lslam.registration.kernels.gicp_residual import EXTENT_M2, source_discs
 
 # Variance added to every voxel, (1 cm)2: a standing sensor would otherwise collapse the Gaussians.
 FLOOR_M2 = 1e-4

@@ -22,7 +22,7 @@ from lslam.core.kernels.linearisation import (
     Width,
 )
 from lslam.core.kernels.residuals import Voxels, octant_slots, place
-from lslam.registration.kernels.discs import disc, keep
+from lslam.registration.kernels.gicp_residual import disc, keep
 
 # Eigenvalues below this share of the largest are raised to it (Magnusson, section 6.2.1).
 SMALLEST_SHARE = 0.01

@@ -14,7 +14,7 @@ from numpy_voxels import VoxelMap
 from lslam.core.geometry import so3
 from lslam.core.kernels import linearisation as at
 from lslam.registration.gaussian_map import GaussianMap
-from lslam.registration.kernels.discs import source_discs
+from lslam.registration.kernels.gicp_residual import source_discs
 from lslam.registration.optimiser import Correspondences
 from lslam.registration.preprocessing.prepare import PreparedPoints
 from lslam.registration.residuals import RESIDUALS as TABLE
