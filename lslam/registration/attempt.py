@@ -6,21 +6,20 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
-import numpy as np
 from numpy.typing import NDArray
 
 from lslam.core.arrays import Floats
 from lslam.core.config.odometry import RegistrationConfig
-from lslam.core.types.scan_result import StageClock
+from lslam.core.types.scan_result import OPEN_RAD, StageClock
 from lslam.core.types.state import Stateful
 from lslam.registration.acceptance import Acceptance, correction
 from lslam.registration.history import History
-from lslam.registration.optimiser import START_ITERATIONS, Annealing
+from lslam.registration.optimiser import KERNEL_DECAY, KERNEL_MIN_M, START_ITERATIONS, Annealing
 from lslam.registration.result import RegistrationResult
 
-# Around a pose that is nearly right the kernel opens so wide, and larger corrections of the prior are checked coarse to fine:
-# priors of steady motion are better.
-RECOVER_M, RECOVER_DEG = 0.3, 3.0
+# m; around a pose that is nearly right the kernel opens one step wider than it ends. Larger corrections of the prior are checked
+# coarse to fine, or turns of `OPEN_RAD`: priors of steady motion are better.
+RECOVER_M = KERNEL_MIN_M / KERNEL_DECAY
 
 
 class Target(Stateful, ABC):
@@ -122,7 +121,7 @@ class Attempt:
     def is_small(self, result: RegistrationResult) -> bool:
         """Whether the result corrects the motion prior by less than `RECOVER_M` and `RECOVER_DEG`."""
         move, turn = result.prior_error
-        return move < RECOVER_M and turn < np.deg2rad(RECOVER_DEG)
+        return move < RECOVER_M and turn < OPEN_RAD
 
 
 class Policy(Protocol):

@@ -14,8 +14,9 @@ from lslam.core.arrays import Bools, Floats, Points
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.config.odometry import RecoveryConfig, RegistrationConfig
 from lslam.core.geometry import se3, so3
+from lslam.core.types.scan_result import OPEN_RAD
 from lslam.registration.alignment import solve, upright_directions, voxel_terms
-from lslam.registration.attempt import RECOVER_DEG, RECOVER_M, Attempt, Policy
+from lslam.registration.attempt import RECOVER_M, Attempt, Policy
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.history import is_more
 from lslam.registration.optimiser import (
@@ -38,8 +39,8 @@ ALL_ALIKE = RegistrationConfig(sigma=NEAR_M, weak_share=0.0)
 HIGH_M = 1.2
 # m; from so far away they find each other: starts that far apart leave no gap, not even between piers of a facade.
 START_STEP_M = 1.0
-# A hand-held sensor turns at 100 deg/s, by 30 deg at every third scan; so far apart that 20 m away a step is left.
-START_TURNS_DEG = np.delete(np.arange(-30.0, 31.0, RECOVER_DEG), 10)
+# rad; a hand-held sensor turns at 100 deg/s, by nearly 30 deg at every third scan; so far apart that 20 m away a step is left.
+START_TURNS = OPEN_RAD * np.delete(np.arange(-10, 11), 10)
 # Along a bare wall the rings repeat best where nothing moved, by five percent: a start elsewhere must have more, and twice
 # as much where planes, the prior or both say otherwise.
 CLEAR_RATIO = 1.05
@@ -198,15 +199,14 @@ def _likeliest(non_ground: NonGroundPoints, high: PreparedPoints, T_prior: Float
     reach : m, of the shifts; up : (3,) axis of the rotations, LiDAR frame
     """
     moved = [T_prior @ se3.make(np.eye(3), offset) for offset in start_offsets(reach, NEAR_M, up)]
-    turns = np.deg2rad(START_TURNS_DEG)
-    turned = [T_prior @ se3.make(so3.exp(turn * up), np.zeros(3)) for turn in turns]
+    turned = [T_prior @ se3.make(so3.exp(turn * up), np.zeros(3)) for turn in START_TURNS]
     return max([*moved, *turned], key=lambda start: non_ground.share(high, start))
 
 
 def is_at_rest(pose: Floats, last: Floats) -> bool:
     """Whether the pose (4, 4) is so near to the last scan's that the sensor's own rings, on roofs or walls, explain it."""
     move, turn = se3.magnitude(se3.relative(last, pose))
-    return bool(move < 2 * NEAR_M and turn < np.deg2rad(RECOVER_DEG))
+    return bool(move < 2 * NEAR_M and turn < OPEN_RAD)
 
 
 def is_much_more(ours: Bools, others: Bools, margin: float = MUCH_RATIO) -> bool:

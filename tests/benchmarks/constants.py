@@ -91,7 +91,7 @@ CONFIG = {"preprocess": "core/config/input.py", "registration": "core/config/odo
 COSINES = {"NEAR_Z"}
 # Shares of which 1 is the whole, and ratios of which 1 is none.
 LACK = {"FORGETTING_FACTOR", "LESS", "USUAL types", "ALIKE inertial", "KERNEL_DECAY", "COARSE_DECAY"}
-EXCESS = {"CLEAR_RATIO", "MUCH_RATIO", "MORE_POINTS_RATIO", "PILED_RATIO"}
+EXCESS = {"CLEAR_RATIO", "MUCH_RATIO", "PILED_RATIO"}
 FACTORS = {"half": 0.5, "double": 2.0}
 
 

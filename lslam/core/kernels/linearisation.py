@@ -39,3 +39,5 @@ COUNT = 7
 SIGNIFICANT_SIGMAS = 2.0
 # A value is none of its noise: one in four hundred is by chance.
 OUTLIER_SIGMAS = 3.0
+# Beyond so many hardly one value of a whole scan lies by chance: one in sixteen thousand does.
+RARE_SIGMAS = 4.0

@@ -72,6 +72,8 @@ FASTEST_M_S = 150.0
 FASTEST_RAD_S = FASTEST_M_S / LEVER_M
 # m/s2, twice gravity: a faster change is an error of registration.
 MOST_ACCELERATION_M_S2 = 20.0
+# s; over a longer pause no motion is extrapolated, and no two scans are neighbours.
+PAUSE_S = 1.0
 # What explains less than this part of what is usual is rejected.
 USUAL = 0.7
 # m, and of turns what that is at `LEVER_M`; what is known no better is open: a motion of which scans say no more, a pose that

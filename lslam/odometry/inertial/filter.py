@@ -14,12 +14,13 @@ import numpy as np
 from lslam.core.arrays import Bools, Floats
 from lslam.core.geometry import noise, se3, so3
 from lslam.core.kernels import linalg
+from lslam.core.kernels.linearisation import RARE_SIGMAS
 from lslam.core.types.imu import GRAVITY
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Span
 from lslam.odometry.inertial.constant_velocity import middle_of
 from lslam.odometry.inertial.fusion import InertialMotion
-from lslam.odometry.inertial.gyroscope import INNOVATION_SIGMAS, MOUNTING, OFFSET_WALK, USUAL_NOISE, Gyroscope, ImuNoise
+from lslam.odometry.inertial.gyroscope import MOUNTING, OFFSET_WALK, USUAL_NOISE, Gyroscope, ImuNoise
 from lslam.odometry.inertial.imu_estimate import GRAVITY_SIGMA_M_S2, GRAVITY_WALK, PLACE_SIGMA, TURN_SIGMA, ImuEstimate
 from lslam.odometry.inertial.integrate import Increments
 from lslam.odometry.kernels import kalman
@@ -197,7 +198,7 @@ class NavigationState:
         H = np.zeros((1, size))
         H[0, DOWN] = self.estimate.gravity / norm
         rest, noise = np.array([GRAVITY - norm]), np.array([[GRAVITY_SIGMA_M_S2**2]])
-        x, P = kalman.update(np.zeros(size), self.covariance, H, rest, noise, INNOVATION_SIGMAS)
+        x, P = kalman.update(np.zeros(size), self.covariance, H, rest, noise, RARE_SIGMAS)
         return self._shift(x, P)
 
     def _share_covariance(self) -> NavigationState:

@@ -11,12 +11,13 @@ import numpy as np
 from lslam.core.arrays import Floats
 from lslam.core.config import Config
 from lslam.core.geometry import se3
+from lslam.core.kernels.linearisation import RARE_SIGMAS
 from lslam.core.types.imu import GRAVITY, GravityDirection, ImuState, ImuStream
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import LEVER_M, Span
 from lslam.core.types.state import Stateful
 from lslam.odometry.inertial.constant_velocity import ConstantVelocity, middle_of
-from lslam.odometry.inertial.gyroscope import INNOVATION_SIGMAS, Gyroscope
+from lslam.odometry.inertial.gyroscope import Gyroscope
 from lslam.odometry.inertial.imu_cleaning import IMU_GAP_S, covers, gaps
 from lslam.odometry.inertial.imu_estimate import ImuEstimate, PredictionErrors
 from lslam.odometry.inertial.initialise import InertialStart
@@ -142,7 +143,7 @@ class InertialMotion(Stateful):
         rest = np.concatenate([end[:3, 3] - begin[:3, 3] - moved, R_imu @ vector_between(R_imu, end[:3, :3])])
         gyroscope = e.calibrate(step, begin[:3, :3], end[:3, :3], C[3:, 3:])
         self._taught = instant_ns, gyroscope, C[:3, :3]
-        if float(kalman.square(rest, P + 2 * C)) / (len(rest) * INNOVATION_SIGMAS**2) > 1:
+        if float(kalman.square(rest, P + 2 * C)) / (len(rest) * RARE_SIGMAS**2) > 1:
             return self._reject(stamp_ns, result, rest, P)
         # A pose that is wrong moves the map by one part in its age only, the scans before hold it: random errors of both
         # then add up to the least drift when those of the IMU count as many times.

@@ -15,11 +15,10 @@ import numpy as np
 from lslam.core.arrays import Floats
 from lslam.core.config.odometry import ImuConfig
 from lslam.core.geometry import so3
+from lslam.core.kernels.linearisation import RARE_SIGMAS
 from lslam.odometry.inertial.integrate import Increments
 from lslam.odometry.kernels import kalman
 
-# Innovations beyond so many sigma are outliers and count accordingly less.
-INNOVATION_SIGMAS = 4.0
 # rad/s per sqrt(Hz), least noise density; rad/s per sqrt(s), random walk of the bias: that of Kalibr's
 # ADIS16448. Ten times more, and turns over more than some seconds were registration's again, with all its noise.
 RATE_NOISE, BIAS_WALK = float(np.deg2rad(0.01)), float(np.deg2rad(0.001))
@@ -180,7 +179,7 @@ class Gyroscope:
             rest,
             noise,
             self.noise.gyro_walk,
-            INNOVATION_SIGMAS,
+            RARE_SIGMAS,
         )
         return self._update(x, P, excess, step)
 
@@ -219,8 +218,8 @@ class Gyroscope:
         H = self.columns(step)
         allowed = float(np.trace(H @ before @ H.T + own))
         x = np.concatenate([self.bias, self.axes.ravel(), [self.offset_s]])
-        x, P = kalman.update(x, before, H, rest, own, INNOVATION_SIGMAS)
-        return self._update(x, P, min(float(rest @ rest), INNOVATION_SIGMAS**2 * allowed) - allowed, step)
+        x, P = kalman.update(x, before, H, rest, own, RARE_SIGMAS)
+        return self._update(x, P, min(float(rest @ rest), RARE_SIGMAS**2 * allowed) - allowed, step)
 
     def _update(self, x: Floats, P: Floats, excess: float, step: Increments) -> Gyroscope:
         """The calibration of mean x and covariance P; `excess`, rad2, of a squared innovation raises the noise of the rates."""

@@ -12,10 +12,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from lslam.core.arrays import Floats, Longs
+from lslam.core.kernels.linearisation import OUTLIER_SIGMAS, RARE_SIGMAS
 from lslam.core.types.imu import GRAVITY, ImuState, ImuStream
 from lslam.core.types.scan import LEVER_M
 from lslam.core.types.state import State, Stateful
-from lslam.odometry.inertial.gyroscope import INNOVATION_SIGMAS, Gyroscope
+from lslam.odometry.inertial.gyroscope import Gyroscope
 from lslam.odometry.inertial.integrate import Increments, integrate
 from lslam.odometry.kernels import kalman
 from lslam.odometry.kernels.rotation import vector_between
@@ -33,8 +34,8 @@ WORSE_RATIO = 2.0
 class PredictionErrors(Stateful):
     """Prediction errors, m, of a sensor and of constant velocity over the newest scans, rotations multiplied by `LEVER_M`."""
 
-    # Scans over which the sensor's median error is tested against constant velocity, and the slack of the test.
-    JUDGED, SLACK_M = 30, 0.02
+    # Scans over which the sensor's median error is tested against constant velocity.
+    MEDIAN_SCANS = 30
 
     def __init__(self) -> None:
         self._pairs: list[tuple[float, float]] = []
@@ -45,11 +46,11 @@ class PredictionErrors(Stateful):
         own, steady : m, of its prediction and of that by constant velocity
         """
         self._pairs.append((own, steady))
-        if len(self._pairs) < self.JUDGED:
+        if len(self._pairs) < self.MEDIAN_SCANS:
             return None
-        newest = np.sort(np.array(self._pairs[-self.JUDGED :]), axis=0)
-        own, steady = (float(v) for v in 0.5 * (newest[(self.JUDGED - 1) // 2] + newest[self.JUDGED // 2]))
-        return (own, steady) if own > WORSE_RATIO * steady + self.SLACK_M else None
+        newest = np.sort(np.array(self._pairs[-self.MEDIAN_SCANS :]), axis=0)
+        own, steady = (float(v) for v in 0.5 * (newest[(self.MEDIAN_SCANS - 1) // 2] + newest[self.MEDIAN_SCANS // 2]))
+        return (own, steady) if own > WORSE_RATIO * steady + OUTLIER_SIGMAS * PLACE_SIGMA else None
 
     @property
     def medians(self) -> tuple[float, float] | None:
@@ -174,9 +175,7 @@ class ImuEstimate:
         step = self._integrate(imu, step.instants_ns, bias)
         place = PLACE_NOISE if noise is None else PLACE_NOISE + noise
         x, P = _propagate(self, step, R)
-        x, P = kalman.correct_by_displacement(
-            x, P, displacement, 2 * place, GRAVITY, GRAVITY_SIGMA_M_S2, INNOVATION_SIGMAS
-        )
+        x, P = kalman.correct_by_displacement(x, P, displacement, 2 * place, GRAVITY, GRAVITY_SIGMA_M_S2, RARE_SIGMAS)
         return self._with(x[3:], P[3:, 3:], step, gyroscope)
 
     def _with(self, x: Floats, P: Floats, step: Increments, gyroscope: Gyroscope | None = None) -> ImuEstimate:

@@ -13,8 +13,9 @@ import numpy as np
 
 from lslam.core.arrays import Floats
 from lslam.core.geometry import se3, so3
+from lslam.core.kernels.linearisation import RARE_SIGMAS
 from lslam.core.types.imu import WheelStream
-from lslam.odometry.inertial.gyroscope import INNOVATION_SIGMAS, NOISE_MEMORY_SCANS, OFFSET_SIGMA
+from lslam.odometry.inertial.gyroscope import NOISE_MEMORY_SCANS, OFFSET_SIGMA
 from lslam.odometry.kernels import kalman
 
 # One sigma of u: along, tyres and their pressure; across, a vehicle's pitch on its springs; of an axis that nobody states.
@@ -177,10 +178,10 @@ def learn_noise(
     others : (N,) part of the squares that is other noise. Half of the squares of a normal error lie below `MEDIAN_SQUARE` of
     its variance: a density grows with each one above, and shrinks with each below, so that slip of any size counts as one
     innovation. Each is weighted by the share of this noise in it: along a direction that registration does not observe it is
-    zero. Innovations beyond `INNOVATION_SIGMAS` count in full.
+    zero. Innovations beyond `RARE_SIGMAS` count in full.
     """
     own = noise * per
-    is_beyond = squares > INNOVATION_SIGMAS**2 * (own + others)
+    is_beyond = squares > RARE_SIGMAS**2 * (own + others)
     share = np.where(is_beyond, 1.0, np.square(own / np.maximum(own + others, 1e-300)))
     counts = np.minimum(counts + share, NOISE_MEMORY_SCANS)
     side = np.where(squares > MEDIAN_SQUARE * (own + others), 1.0, -1.0)

@@ -11,13 +11,13 @@ import numpy as np
 from lslam.core.arrays import Floats
 from lslam.core.config.odometry import WheelsConfig
 from lslam.core.geometry import se3, so3
+from lslam.core.kernels.linearisation import RARE_SIGMAS
 from lslam.core.types.imu import GRAVITY, WheelStream
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import LEVER_M, Span
 from lslam.core.types.sequence import Sequence
 from lslam.io.readers.wheels import read_wheels
 from lslam.odometry.inertial.constant_velocity import USUAL_ACCELERATION, ConstantVelocity, middle_of
-from lslam.odometry.inertial.gyroscope import INNOVATION_SIGMAS
 from lslam.odometry.inertial.imu_cleaning import WHEEL_GAP_S, covers, gaps
 from lslam.odometry.inertial.imu_estimate import PredictionErrors
 from lslam.odometry.inertial.wheel_calibration import (
@@ -152,7 +152,7 @@ class WheelMotion(ConstantVelocity):
         P[3:, 3:] += UNTOLD * (np.eye(3) - np.outer(up, up))
         turn = so3.log(middle[:3, :3] @ reckoning.pose[:3, :3].T)
         rest = np.concatenate([middle[:3, 3] - reckoning.pose[:3, 3], turn])
-        excess = kalman.square(rest, P + 2 * C) / INNOVATION_SIGMAS**2
+        excess = kalman.square(rest, P + 2 * C) / RARE_SIGMAS**2
         if excess > len(G.T) and self._is_contrary(reckoning, middle):
             pose = reckoning.pose @ se3.relative(middle, result.T_world_lidar)
             metres, degrees = float(np.linalg.norm(rest[:3])), float(np.rad2deg(np.linalg.norm(rest[3:])))
@@ -220,7 +220,7 @@ class WheelMotion(ConstantVelocity):
             others[:3, :3] = seconds**4 * by_axis(self._acceleration[0], self._acceleration[1], u)
             others[3, 3] = seconds**4 * self._acceleration[2]
             since = seconds if self._agreed_ns is None else max(seconds, 1e-9 * (instant_ns - self._agreed_ns))
-            most = (GRAVITY * since * seconds) ** 2 + INNOVATION_SIGMAS**2 * float(u @ noise[:3, :3] @ u)
+            most = (GRAVITY * since * seconds) ** 2 + RARE_SIGMAS**2 * float(u @ noise[:3, :3] @ u)
             change = float(u @ more[:3])
             is_slip = change**2 > most
             noise[:3, :3] += is_slip * change**2 * np.outer(u, u)

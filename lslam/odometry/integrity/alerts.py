@@ -11,7 +11,8 @@ from lslam.core.arrays import Bools, Floats, Longs
 from lslam.core.geometry import se3
 from lslam.core.kernels.linearisation import OUTLIER_SIGMAS
 from lslam.core.types.scan_result import MOST_ACCELERATION_M_S2, OPEN_M, OPEN_RAD, SAME_M, USUAL, MotionCheck
-from lslam.odometry.integrity.pair_registration import EMPTIED_SHARE, MORE_POINTS_RATIO, is_within
+from lslam.odometry.integrity.pair_registration import EMPTIED_SHARE, is_within
+from lslam.registration.policies import MUCH_RATIO
 
 # Consistent checks in a row, two seconds of them, and least deviations, m and rad: few rings constrain tilt poorly.
 IN_A_ROW = 4
@@ -75,7 +76,7 @@ def _noise(apart: Floats) -> Floats:
 
 def _stretches(checks: list[MotionCheck], apart: Floats, sigma: Floats, axis: int) -> list[tuple[int, int]]:
     """Ranges of checks along one axis whose deviation `apart` (m or rad) is significant in a row, or large in a single check."""
-    is_better = np.array([check.agreement > MORE_POINTS_RATIO * check.claimed_agreement for check in checks])
+    is_better = np.array([check.agreement > MUCH_RATIO * check.claimed_agreement for check in checks])
     is_large = is_better & (np.abs(apart) > LARGE[axis] + 2 * OUTLIER_SIGMAS * sigma)
     stretches = []
     for begin, end in _runs(np.where(np.abs(apart) > LEAST_DEVIATION[axis], np.sign(apart), 0)):

@@ -12,7 +12,7 @@ from lslam.core.geometry import se3
 from lslam.core.types.imu import GRAVITY
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
-from lslam.core.types.scan_result import STILL_M, MotionCheck, ScanResult
+from lslam.core.types.scan_result import PAUSE_S, STILL_M, MotionCheck, ScanResult
 from lslam.core.types.state import Stateful
 from lslam.odometry.integrity.pair_registration import (
     PairRegistration,
@@ -30,10 +30,6 @@ from lslam.registration.preprocessing.prepare import PreparedPoints, few_of, pre
 # A pair of scans is so long apart, s, and the sensor moves by less than this part of the median range between them, where
 # scans lie closer.
 LAG_S, REACH_SHARE = 0.45, 0.75
-# s; no motion is extrapolated over longer.
-MAX_EXTRAPOLATION_S = 3 * LAG_S
-# s; a longer pause between two scans is a break.
-PAUSE_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -129,7 +125,7 @@ class IntegrityMonitor(Stateful):
 
     def _extrapolate(self, seconds: float) -> Floats | None:
         """The motion (4, 4) over `seconds` at constant velocity; None where that is unknown."""
-        if self._motion is None or seconds > MAX_EXTRAPOLATION_S:
+        if self._motion is None or seconds > PAUSE_S:
             return None
         motion, before = self._motion
         return np.asarray(se3.exp(seconds / before * se3.log(motion)))

@@ -31,6 +31,7 @@ from lslam.registration.optimiser import (
     Term,
     optimise,
 )
+from lslam.registration.policies import MUCH_RATIO
 from lslam.registration.preprocessing.prepare import PreparedPoints
 from lslam.registration.residuals import PLANES_ALONE
 from lslam.registration.result import RegistrationResult
@@ -77,13 +78,10 @@ def empty_share(before: Longs, now: Longs) -> float:
 
 
 SETTINGS = RegistrationConfig()
-# Edge of the smallest voxels as a part of the median range of the points, and its bounds, m: a voxel is small against the
-# room, and spans several points and several sigma of their noise.
-EDGE_SHARE, SMALLEST_M, LARGEST_M = 0.2, 0.3, COARSE_FACTOR * SETTINGS.voxel_size
-# Half of an edge is how far a plane reaches.
-CAPTURE_EDGES = 0.4
-# Another motion than the claimed one must explain so many times more points.
-MORE_POINTS_RATIO = 1.1
+# Edge of the smallest voxels as a part of the median range of the points: small against the room, and several points wide.
+EDGE_SHARE = 0.2
+# m; its bounds: a plane reaches as far as half an edge, which is the kernel's end width at least.
+SMALLEST_M, LARGEST_M = 2 * KERNEL_MIN_M, COARSE_FACTOR * SETTINGS.voxel_size
 
 
 @dataclass(frozen=True)
@@ -156,8 +154,7 @@ class PairRegistration:
 
     def near(self, start: Floats) -> MotionHypothesis:
         """The motion (4, 4) registered from `start`, within reach of the planes."""
-        widest = max(CAPTURE_EDGES * self._edge, KERNEL_MIN_M)
-        return self._register(start, Annealing(widest, SETTINGS.max_iterations))
+        return self._register(start, Annealing(self._edge / 2, SETTINGS.max_iterations))
 
     def far(self, start: Floats) -> MotionHypothesis:
         """The motion registered from `start` (4, 4) by a search of some metres around it."""
@@ -177,12 +174,12 @@ class PairRegistration:
 
 
 def best_of(hypotheses: Sequence[MotionHypothesis]) -> tuple[MotionHypothesis, MotionHypothesis | None]:
-    """The motion with the most points, the first one unless another has many more (`MORE_POINTS_RATIO`), and its rival.
+    """The motion with the most points, the first one unless another has many more (`MUCH_RATIO`), and its rival.
 
     A rival is another motion whose own points are at least half as many as those of the best.
     """
     best = max(hypotheses, key=lambda h: h.result.inliers)
-    if best.result.inliers <= MORE_POINTS_RATIO * hypotheses[0].result.inliers:
+    if best.result.inliers <= MUCH_RATIO * hypotheses[0].result.inliers:
         best = hypotheses[0]
     rivals = [h for h in hypotheses if not h.is_same(best) and 2 * h.own_points(best) >= best.own_points(h)]
     return best, max(rivals, key=lambda h: h.own_points(best), default=None)

@@ -14,7 +14,7 @@ from lslam.core.config.input import PreprocessConfig
 from lslam.core.config.odometry import LoamConfig
 from lslam.core.errors import InputError
 from lslam.core.geometry import so3
-from lslam.core.kernels.linearisation import SIGNIFICANT_SIGMAS
+from lslam.core.kernels.linearisation import RARE_SIGMAS, SIGNIFICANT_SIGMAS
 from lslam.core.types.scan import Scan
 from lslam.registration.kernels import curvature
 from lslam.registration.kernels.curvature import WIDEST_STEP
@@ -31,8 +31,6 @@ _SPINS = 0.5
 _GAP_STEPS = 2.5
 # Curvature of equation 2.21 over the angle between beams: edges have more, planes less; a right angle has 2.7.
 EDGE_CURVATURE, PLANAR_CURVATURE = 1.0, 0.5
-# An edge's curvature over what the noise of the ranges makes, which is measured in each scan.
-EDGE_NOISE_RATIO = 4.0
 # m; a jump in range from beam to beam that hides what is behind.
 OCCLUSION_M = 0.3
 # Angle of incidence above which a surface is parallel to the beam.
@@ -143,7 +141,7 @@ def features_along(scan: Scan, walk: RingWalk, config: LoamConfig, may_be: NDArr
         (config.max_edge_points, config.max_less_edge_points, config.max_planar_points),
         EDGE_CURVATURE * walk.step,
         PLANAR_CURVATURE * walk.step,
-        EDGE_NOISE_RATIO * noise,
+        RARE_SIGMAS * noise,
         SIGNIFICANT_SIGMAS * noise,
     )
     return gather_features(scan, walk, labels, config.grid_step)

@@ -10,13 +10,12 @@ from lslam.core.arrays import Bools, Floats
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.config.odometry import LoamConfig
 from lslam.core.errors import InputError
-from lslam.core.kernels.linearisation import SIGNIFICANT_SIGMAS
+from lslam.core.kernels.linearisation import RARE_SIGMAS, SIGNIFICANT_SIGMAS
 from lslam.core.types.scan import NO_RING, Scan
 from lslam.registration.kernels import curvature, petals
 from lslam.registration.kernels.curvature import WIDEST_STEP
 from lslam.registration.preprocessing.features import (
     EDGE_CURVATURE,
-    EDGE_NOISE_RATIO,
     MAY_BE_EDGE,
     OCCLUSION_M,
     PARALLEL_DEG,
@@ -81,7 +80,7 @@ def petal_features(scan: Scan, config: LoamConfig | None = None, gate: Preproces
         (*limits, config.max_planar_points),
         EDGE_CURVATURE * usual,
         PLANAR_CURVATURE * usual,
-        EDGE_NOISE_RATIO * noise,
+        RARE_SIGMAS * noise,
         SIGNIFICANT_SIGMAS * noise,
     )
     if len(brightness):

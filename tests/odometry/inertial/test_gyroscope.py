@@ -9,8 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 from lslam.core.geometry import so3
+from lslam.core.kernels.linearisation import RARE_SIGMAS
 from lslam.core.types.imu import ImuStream
-from lslam.odometry.inertial.gyroscope import INNOVATION_SIGMAS, Gyroscope
+from lslam.odometry.inertial.gyroscope import Gyroscope
 from lslam.odometry.inertial.integrate import Increments, integrate
 from lslam.odometry.kernels import kalman
 
@@ -134,7 +135,7 @@ def test_an_update_agrees_with_the_sum_of_informations() -> None:
     A, B = rng.normal(size=(5, 5)), rng.normal(size=(2, 2))
     P, noise, H, x = A @ A.T, B @ B.T, rng.normal(size=(2, 5)), rng.normal(size=5)
     rest = 0.5 * np.sqrt(np.diag(noise))
-    mean, covariance = kalman.update(x, P, H, rest, noise, INNOVATION_SIGMAS)
+    mean, covariance = kalman.update(x, P, H, rest, noise, RARE_SIGMAS)
     information = np.linalg.inv(P) + H.T @ np.linalg.solve(noise, H)
     np.testing.assert_allclose(covariance, np.linalg.inv(information), rtol=1e-8, atol=1e-10)
     gain = np.linalg.solve(information, H.T @ np.linalg.solve(noise, rest))
@@ -143,8 +144,8 @@ def test_an_update_agrees_with_the_sum_of_informations() -> None:
 
 def test_an_outlier_moves_the_mean_less_than_what_is_likely() -> None:
     x, P, H, noise = np.zeros(1), np.eye(1), np.eye(1), np.eye(1)
-    likely = kalman.update(x, P, H, np.array([4.0]), noise, INNOVATION_SIGMAS)[0]
-    outlier = kalman.update(x, P, H, np.array([400.0]), noise, INNOVATION_SIGMAS)[0]
+    likely = kalman.update(x, P, H, np.array([4.0]), noise, RARE_SIGMAS)[0]
+    outlier = kalman.update(x, P, H, np.array([400.0]), noise, RARE_SIGMAS)[0]
     assert 0 < outlier[0] < likely[0]
 
 

@@ -9,10 +9,11 @@ from stub_sequences import Stub
 
 from lslam.core.errors import InputError
 from lslam.core.geometry import se3, so3
+from lslam.core.kernels.linearisation import RARE_SIGMAS
 from lslam.core.types.imu import ImuStream
 from lslam.odometry.frontend.inertial_start import _require_rate
 from lslam.odometry.inertial.agreement import check_agreement
-from lslam.odometry.inertial.gyroscope import INNOVATION_SIGMAS, Gyroscope
+from lslam.odometry.inertial.gyroscope import Gyroscope
 from lslam.odometry.inertial.imu_cleaning import ImuRefusedError, clean
 from lslam.odometry.inertial.imu_estimate import ImuEstimate
 from lslam.odometry.inertial.initialise import FirstPoses, _fit_velocity_and_gravity, _is_static
@@ -28,7 +29,7 @@ IMU_NS, SCAN_NS = 10_000_000, 100_000_000
 def test_an_outlier_begins_beyond_four_sigmas(sigmas: float, gain: float) -> None:
     """Prior and measurement of one variance each, so that sigma is sqrt(2): at 8 of them the noise is 4 times as large."""
     rest = sigmas * np.sqrt(2.0)
-    x, P = kalman.update(np.zeros(1), np.eye(1), np.eye(1), np.array([rest]), np.eye(1), INNOVATION_SIGMAS)
+    x, P = kalman.update(np.zeros(1), np.eye(1), np.eye(1), np.array([rest]), np.eye(1), RARE_SIGMAS)
     assert x[0] == pytest.approx(gain * rest)
     assert P[0, 0] == pytest.approx(1 - gain)
 

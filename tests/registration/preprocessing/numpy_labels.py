@@ -76,9 +76,7 @@ def _one_ring(ring: Ring, r: Any, step: float, slope: float, noise: float, confi
         sharp = [
             i
             for i in part
-            if i in c
-            and bend[i] > features.EDGE_CURVATURE * step
-            and bend[i] * r[i] > features.EDGE_NOISE_RATIO * noise
+            if i in c and bend[i] > features.EDGE_CURVATURE * step and bend[i] * r[i] > features.RARE_SIGMAS * noise
         ]
         picked = 0
         for i in sorted(sharp, key=lambda i: (-c[i], i)):

@@ -70,7 +70,7 @@ def picks_of_reference(scan: Scan, config: LoamConfig) -> NDArray[np.int64]:
         ),
         (
             LoamConfig(regions=1),
-            {"EDGE_CURVATURE": 0.5, "PLANAR_CURVATURE": 0.2, "EDGE_NOISE_RATIO": 2.0, "PARALLEL_DEG": 60.0},
+            {"EDGE_CURVATURE": 0.5, "PLANAR_CURVATURE": 0.2, "RARE_SIGMAS": 2.0, "PARALLEL_DEG": 60.0},
         ),
     ],
 )
