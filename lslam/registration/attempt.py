@@ -6,10 +6,12 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
+import numpy as np
 from numpy.typing import NDArray
 
 from lslam.core.arrays import Floats
 from lslam.core.config.odometry import RegistrationConfig
+from lslam.core.geometry import noise
 from lslam.core.types.scan_result import OPEN_RAD, StageClock
 from lslam.core.types.state import Stateful
 from lslam.registration.acceptance import Acceptance, correction
@@ -75,6 +77,7 @@ class Attempt:
     """A scan, its motion prior (4, 4), and the state of the registration that is to place it.
 
     start : where the coarse planes put the scan, which the result began from; the prior where they were not tried
+    information : (6, 6) of the prior, world axes, 1/m2 and 1/rad2; None where nobody knows it
     """
 
     target: Any
@@ -85,6 +88,7 @@ class Attempt:
     is_near: bool = False
     clock: StageClock = field(default_factory=StageClock)
     start: RegistrationResult | None = None
+    information: Floats | None = None
 
     @property
     def annealing(self) -> Annealing:
@@ -98,16 +102,18 @@ class Attempt:
 
     def judge(self, result: RegistrationResult, T_prior: Floats | None = None) -> RegistrationResult:
         """The result with its correction of the prior, or a failed one at the prior with the reason."""
-        c, history = self.config, self.history
+        c, history, T_expected = self.config, self.history, self.T_prior if T_prior is None else T_prior
+        # What the prior does not confirm must agree as usual: nothing else tells it from a place that looks alike.
+        is_confirmed = history.starting > 0 or self._confirms(T_expected, result.T_world_lidar)
         limits = Acceptance(
             c.min_overlap,
-            history.matches.least,
+            history.matches.least if is_confirmed else history.matches.LESS * history.matches.usual,
             max_jump_m=c.max_jump_m,
             max_jump_deg=c.max_jump_deg,
             usual=history.agreement,
             source=self.target.source,
         )
-        return limits.judge(result, self.T_prior if T_prior is None else T_prior)
+        return limits.judge(result, T_expected)
 
     def credit(self, result: RegistrationResult, pose_source: str) -> RegistrationResult:
         """The result labelled with the policy `pose_source` that produced it, and with its correction of the prior."""
@@ -122,6 +128,18 @@ class Attempt:
         """Whether the result corrects the motion prior by less than `RECOVER_M` and `RECOVER_DEG`."""
         move, turn = result.prior_error
         return move < RECOVER_M and turn < OPEN_RAD
+
+    def _confirms(self, T_prior: Floats, pose: Floats) -> bool:
+        """Whether a pose (4, 4) is no other place than the prior: as near as that of steady motion, or as its information says.
+
+        Turns lead to no other place, and a hand's come as a surprise.
+        """
+        if np.linalg.norm(pose[:3, 3] - T_prior[:3, 3]) < RECOVER_M:
+            return True
+        if self.information is None:
+            return False
+        change = noise.changes(T_prior, pose)
+        return bool(change @ self.information @ change < noise.quantile(noise.RIGHT_PROBABILITY, 6))
 
 
 class Policy(Protocol):

@@ -107,16 +107,23 @@ class Registration(Stateful):
             return replace(failure(T_prior, count, reason), points=points)
         if len(self.target) == 0:
             return RegistrationResult(T_prior, covariance=np.diag([1e-12] * 6), source_points=count, points=points)
-        attempt = self.attempt(points, T_prior, is_near, clock)
+        attempt = self.attempt(points, T_prior, is_near, clock, information)
         result = attempt.judge(self.target.align(attempt, T_prior, attempt.annealing, information))
         for policy in () if is_near else self.policies:
             result = policy.recover(attempt, result)
         return replace(result, points=points)
 
-    def attempt(self, points: Any, T_prior: Floats, is_near: bool = False, clock: StageClock | None = None) -> Attempt:
-        """The scan with its prior (4, 4), target and history, as recovery policies take it."""
-        ready = self.target.ready(points)
-        return Attempt(self.target, ready, T_prior, self.config, self.history, is_near, clock or StageClock())
+    def attempt(
+        self,
+        points: Any,
+        T_prior: Floats,
+        is_near: bool = False,
+        clock: StageClock | None = None,
+        information: Floats | None = None,
+    ) -> Attempt:
+        """The scan with its prior (4, 4), of that `information` (6, 6), target and history, as recovery policies take it."""
+        ready, clock = self.target.ready(points), clock or StageClock()
+        return Attempt(self.target, ready, T_prior, self.config, self.history, is_near, clock, information=information)
 
     def update(self, result: RegistrationResult) -> RegistrationResult:
         """Insert the scan into the map unless its registration failed; adapt to it unless its pose was rejected.

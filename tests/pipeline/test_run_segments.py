@@ -110,6 +110,14 @@ def test_all_scans_after_a_gap_are_registered_and_tied_to_those_before(gapped: t
     assert np.isfinite(sigmas).all()
 
 
+@pytest.mark.parametrize("method", ["gicp", "vgicp", "loam"])
+def test_a_second_of_missing_scans_in_a_bend_leads_no_method_to_a_place_that_looks_alike(method: str) -> None:
+    drive = kept(sample(60), [i for i in range(60) if not GAP <= i < GAP + 10])
+    evaluation = lslam.run(drive, config(f"odometry.method={method}")).evaluation
+    assert evaluation is not None
+    assert evaluation.ate["se3"].translation.max < 0.15  # type: ignore[union-attr]
+
+
 def test_a_tie_is_named_wherever_a_run_speaks(gapped: tuple[Path, RunOutcome]) -> None:
     out, _ = gapped
     assert manifest(out)["status"] == "degraded"

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from lslam.core.arrays import Floats
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.geometry import se3, so3
 from lslam.registration.acceptance import PRIOR_COVARIANCE, Acceptance, correction
@@ -44,6 +46,31 @@ def test_the_share_of_matches_that_agree_is_judged_by_the_share_of_earlier_scans
         history = History(RegistrationConfig())
         history.matches.observe(usual)
         assert attempt(RegistrationConfig(), history).judge(result).ok == is_accepted
+
+
+def test_what_the_prior_does_not_confirm_must_agree_as_usual() -> None:
+    """After a second of missing scans a place that looks alike, 10 m on, has 60 % of the usual inliers."""
+    history = History(RegistrationConfig())
+    history.starting = 0
+    history.matches.observe(0.8)
+
+    def is_accepted(metres: float, inliers: int, information: Floats | None = None) -> bool:
+        result = RegistrationResult(PRIOR @ moved(metres), source_points=100, matched=100, inliers=inliers)
+        return replace(attempt(RegistrationConfig(), history), information=information).judge(result).ok
+
+    assert is_accepted(0.1, 48)
+    assert not is_accepted(1.0, 48)
+    assert is_accepted(1.0, 70)
+    # An IMU that may err by as much confirms it, one that is sure does not.
+    assert is_accepted(1.0, 48, np.diag([4.0] * 6))
+    assert not is_accepted(1.0, 48, np.diag([400.0] * 6))
+    # While the speed is unknown every correction is large.
+    history.starting = 1
+    assert is_accepted(1.0, 48)
+
+
+def moved(metres: float) -> Floats:
+    return se3.make(np.eye(3), np.array([metres, 0.0, 0.0]))
 
 
 def test_an_accepted_result_has_its_correction_of_the_prior() -> None:
