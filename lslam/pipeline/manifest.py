@@ -117,7 +117,7 @@ class Manifest:
         bad = [r for r in results if r.status != "ok"]
         if bad:
             self.problems.append(
-                f"{len(bad)} of {len(results)} scans were not registered and follow the motion prior, "
+                f"{len(bad)} of {len(results)} scans were not registered, their poses are interpolated or predicted, "
                 f"the first is scan {bad[0].index}: {bad[0].reason}"
             )
         if diverges:

@@ -31,7 +31,7 @@ class RunFacts:
     """Numbers of a run.
 
     status : the manifest's word: `done`, `degraded`, `diverged`, `interrupted`, `failed`; reasons : why, one sentence each
-    registered, bridged, skipped : scans that were registered, followed the motion prior, could not be read
+    registered, bridged, skipped : scans that were registered, that failed, that could not be read
     standing : scans of a sensor at rest, registered or not
     failures : scans that were bridged or skipped; degenerate : index of each pose with directions that its scan did not constrain
     stand_ins : number of scans by fallback that posed them in place of the method, in order of first use

@@ -143,8 +143,8 @@ MOTION_PRIOR, STATIONARY = "motion prior", "standing"
 class ScanResult:
     """The result of odometry for one scan.
 
-    status : `ok` registered; `bridged` registration failed and the motion prior stands in; `skipped` the scan could
-        not be read or was empty, the motion prior stands in
+    status : `ok` registered; `bridged` registration failed; `skipped` the scan could not be read or was empty. In both the
+        motion prior stands in, after the run what is interpolated between the scans before and after
     T_world_lidar : (4, 4) pose at the scan's stamp
     covariance : (6, 6) of the pose in the world, t' = t + d[:3], R' = exp(d[3:]) R in world axes, m2 and rad2; grows with
         the distance travelled. None when the method has none

@@ -210,7 +210,7 @@ def trajectory_text(survey: Survey, name: str) -> str:
         f"{', '.join(about)}"
         f"{'' if is_local else ' of the grid; yaw counts from east to north'}; qx to qw is the same rotation",
         f"sigma_*: one standard deviation by the covariances, {precision_note(survey)}; rotations, deg, about {', '.join(about)}",
-        "status: ok was registered, bridged follows the motion prior, skipped has no points",
+        "status: ok was registered, bridged and skipped (no points) are interpolated or predicted",
         "frame: lidar",
     ]
     sigmas = tuple(f"sigma_{axis}_m" for axis in axes) + tuple(f"sigma_about_{axis}_deg" for axis in about)
