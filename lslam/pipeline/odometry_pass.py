@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 
 from lslam.backend.keyframes.store import KeyframeStore
-from lslam.core.arrays import Floats
+from lslam.core.arrays import Floats, Longs
 from lslam.core.config import Config
 from lslam.core.errors import InputError
 from lslam.core.geometry import se3
@@ -118,7 +118,7 @@ def estimate_poses(job: PreparedRun) -> RunRecord:
     _report_faults(results, manifest)
     results = join_segments(results, store, config, manifest, watch.should_stop)
     if motion is None:
-        results = interpolate_others(results)
+        results = interpolate_gaps(results)
     manifest.keyframes = {"count": len(store), "bytes": store.size}
     manifest.judge(results, len(sequence), diverges(results))
     checks = [] if monitor is None else checks_within(monitor.checks, results)
@@ -140,31 +140,35 @@ def estimate_poses(job: PreparedRun) -> RunRecord:
     )
 
 
-def interpolate_others(results: list[ScanResult]) -> list[ScanResult]:
+def interpolate_gaps(results: list[ScanResult]) -> list[ScanResult]:
     """Results whose unregistered scans lie on the course of the registered ones before and after them, in one frame.
 
     While a drive is recorded constant velocity is all that is known of them. Monotone cubics through two poses on each side
     (Fritsch and Carlson 1980) do not swing out over a long gap. Scans with none before or after keep their prediction.
     """
-    from scipy.interpolate import PchipInterpolator
-
     frames = np.array([r.frame if r.status == "ok" else -1 for r in results])
     stamps = np.array([r.stamp_ns for r in results], np.int64)
     out = list(results)
     for frame in np.unique(frames[frames >= 0]):
         known = np.flatnonzero(frames == frame)
-        for a, b in pairwise(known.tolist()):
-            missing = [k for k in range(a + 1, b) if frames[k] < 0 and results[k].frame == frame]
-            around = known[max(np.searchsorted(known, a) - 1, 0) : np.searchsorted(known, b) + 2]
-            if missing and np.all(np.diff(stamps[around]) > 0):
-                poses = np.stack([results[k].at_stamp.T_world_lidar for k in around])
-                twists = se3.log(se3.relative(poses[0], poses))
-                course = PchipInterpolator(1e-9 * (stamps[around] - stamps[a]), twists)
-                for k, twist in zip(missing, course(1e-9 * (stamps[missing] - stamps[a])), strict=True):
-                    out[k] = replace(
-                        results[k], T_world_lidar=se3.normalise(poses[0] @ se3.exp(twist)), stamp_offset=None
-                    )
+        for i in np.flatnonzero(np.diff(known) > 1).tolist():
+            gap = [k for k in range(known[i] + 1, known[i + 1]) if frames[k] < 0 and results[k].frame == frame]
+            around = known[max(i - 1, 0) : i + 3]
+            if not gap or np.any(np.diff(stamps[around]) <= 0):
+                continue
+            for k, pose in zip(gap, _course_through([results[k] for k in around], stamps[gap]), strict=True):
+                out[k] = replace(results[k], T_world_lidar=pose, stamp_offset=None)
     return out
+
+
+def _course_through(results: list[ScanResult], stamps_ns: Longs) -> Floats:
+    """(K, 4, 4) poses at `stamps_ns` (K,) on monotone cubics through those of the results, whose stamps increase."""
+    from scipy.interpolate import PchipInterpolator
+
+    poses, begin = np.stack([r.at_stamp.T_world_lidar for r in results]), results[0].stamp_ns
+    seconds = 1e-9 * np.array([r.stamp_ns - begin for r in results])
+    course = PchipInterpolator(seconds, se3.log(se3.relative(poses[0], poses)))
+    return se3.normalise(poses[0] @ se3.exp(course(1e-9 * (stamps_ns - begin))))
 
 
 def _begin_segment(job: PreparedRun, inertial: Inertial) -> Begin | None:

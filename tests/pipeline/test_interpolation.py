@@ -14,7 +14,7 @@ from lslam.core.config import load_config
 from lslam.core.geometry import se3
 from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import ScanResult
-from lslam.pipeline.odometry_pass import interpolate_others
+from lslam.pipeline.odometry_pass import interpolate_gaps
 
 BAD = slice(20, 24)
 
@@ -52,7 +52,7 @@ def off(found: list[ScanResult], truth: Floats) -> float:
 
 def test_bridged_scans_lie_on_the_course_between_those_before_and_after() -> None:
     bridged, truth = results()
-    found = interpolate_others(bridged)
+    found = interpolate_gaps(bridged)
     assert off(bridged, truth) > 0.25
     assert off(found, truth) < 0.03
     assert [r.status for r in found] == [r.status for r in bridged]
@@ -62,14 +62,14 @@ def test_bridged_scans_lie_on_the_course_between_those_before_and_after() -> Non
 
 def test_nothing_is_drawn_from_one_frame_to_another_nor_beyond_the_last_scan() -> None:
     for given in (results(frame_after=1)[0], results()[0][: BAD.stop]):
-        assert interpolate_others(given) == given
+        assert interpolate_gaps(given) == given
 
 
 def test_a_course_that_turns_back_does_not_swing_out_over_a_long_gap() -> None:
     made, _ = results()
     there = [made[0], *made[:5], *(replace(r, status="skipped") for r in made[5:35]), made[4], made[3]]
     given = [replace(r, index=k, stamp_ns=100_000_000 * k) for k, r in enumerate(there)]
-    xs = [r.T_world_lidar[0, 3] for r in interpolate_others(given)]
+    xs = [r.T_world_lidar[0, 3] for r in interpolate_gaps(given)]
     assert max(xs) <= made[4].T_world_lidar[0, 3] + 1e-9
 
 
