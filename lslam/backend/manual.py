@@ -15,7 +15,8 @@ from lslam.backend.georeferencing import require_crs
 from lslam.core.arrays import Floats, Longs
 from lslam.core.config import Config
 from lslam.core.errors import InputError, UsageError, cause, nearest
-from lslam.core.geometry.geodesy import crs_of, parse_crs
+from lslam.core.geometry.crs_names import parse_crs
+from lslam.core.geometry.geodesy import crs_of
 from lslam.core.geometry.se3 import poses_at
 from lslam.core.types.constraint import ControlPoint, ControlResidual, Instant, KnownPair, Manual, NamedPair
 from lslam.core.types.scan_result import ScanResult

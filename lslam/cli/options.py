@@ -243,7 +243,7 @@ def output_crs(given: dict[str, Any]) -> OutputCrs | None:
     crs, geoid = given["crs"], given["geoid"] or ""
     if crs is None and not geoid:
         return None
-    from lslam.core.geometry.geodesy import parse_crs
+    from lslam.core.geometry.crs_names import parse_crs
 
     epsg, height_epsg = (None, None) if crs is None else parse_crs(crs)
     grid = Path(geoid).expanduser()

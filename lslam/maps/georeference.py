@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from lslam.core.arrays import Floats
 from lslam.core.errors import UsageError
 from lslam.core.geometry import se3, so3
+from lslam.core.geometry.crs_names import crs_name
 from lslam.core.geometry.geodesy import (
-    crs_name,
     crs_of,
     exact_transformer,
     from_local,

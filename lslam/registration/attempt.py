@@ -104,10 +104,12 @@ class Attempt:
         """The result with its correction of the prior, or a failed one at the prior with the reason."""
         c, history, T_expected = self.config, self.history, self.T_prior if T_prior is None else T_prior
         # What the prior does not confirm must agree as usual: nothing else tells it from a place that looks alike.
-        is_confirmed = history.starting > 0 or self._confirms(T_expected, result.T_world_lidar)
+        asks_more = history.starting == 0 and not self._confirms(T_expected, result.T_world_lidar)
         limits = Acceptance(
             c.min_overlap,
-            history.matches.least if is_confirmed else history.matches.LESS * history.matches.usual,
+            history.matches.LESS * history.matches.usual
+            if asks_more and c.min_agreement > 0
+            else history.matches.least,
             max_jump_m=c.max_jump_m,
             max_jump_deg=c.max_jump_deg,
             usual=history.agreement,

@@ -13,7 +13,7 @@ from pyproj import CRS, Transformer
 
 from lslam.core.errors import UsageError
 from lslam.core.geometry import se3, so3
-from lslam.core.geometry.geodesy import parse_crs
+from lslam.core.geometry.crs_names import parse_crs
 from lslam.core.types.cloud import ArrayCloud
 from lslam.core.types.gnss import Georeference
 from lslam.core.types.trajectory import Trajectory

@@ -235,8 +235,8 @@ def _jump_spans(seconds: Floats) -> list[int]:
 
     A wrong place that the map takes three scans to let go is no jump from one scan to the next.
     """
-    longest = np.sqrt(OPEN_M / MOST_ACCELERATION_M_S2) / np.median(np.diff(seconds))
-    return sorted({1, min(int(np.ceil(longest)), (len(seconds) - 1) // 2)})
+    apart = int(np.ceil(np.sqrt(OPEN_M / MOST_ACCELERATION_M_S2) / np.median(np.diff(seconds))))
+    return sorted({1, apart}) if 2 * apart < len(seconds) else [1]
 
 
 def _velocity_changes(positions: Floats, seconds: Floats, apart: int = 1) -> tuple[Floats, Floats]:

@@ -26,7 +26,7 @@ from lslam.backend.keyframes.store import KeyframeStore, mounted_up
 from lslam.backend.loops.find_loops import verify_pairs, view_pair
 from lslam.backend.manual import keyframe_pairs, read_control_points, read_named_pairs, stamp_of
 from lslam.core.errors import InputError, OutputError, OutputExistsError, UsageError, cause
-from lslam.core.geometry.geodesy import crs_name, parse_crs
+from lslam.core.geometry.crs_names import crs_name, parse_crs
 from lslam.core.types.constraint import Instant, NamedPair
 from lslam.core.types.scan_result import ScanResult
 from lslam.io.formats.atomic import write_text

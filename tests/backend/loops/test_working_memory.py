@@ -158,5 +158,5 @@ def test_neighbours_that_look_alike_are_rehearsed_as_one_place() -> None:
 
 
 def test_an_unbounded_memory_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    bounded, every = (detect(monkeypatch, memory, 400, 2.2)[0] for memory in ("bounded", "all"))
+    bounded, every = (detect(monkeypatch, places, 2.2)[0] for places in (400, None))
     assert [repr(c) for c in bounded] == [repr(c) for c in every]
