@@ -15,7 +15,7 @@ from lslam.core.geometry import se3
 from lslam.core.types.imu import GravityDirection, ImuState
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Span
-from lslam.core.types.scan_result import MOST_ACCELERATION_M_S2, PAUSE_S
+from lslam.core.types.scan_result import MOST_ACCELERATION_M_S2
 from lslam.core.types.state import State, Stateful
 from lslam.registration.preprocessing.deskew import knots_over
 from lslam.registration.result import RegistrationResult
@@ -148,6 +148,8 @@ class ConstantVelocity(Stateful, MotionModel):
     pose : (4, 4) expected of the first scan, the identity when None
     """
 
+    # Bound of extrapolation, in last steps: the speed after a longer pause is unknown.
+    MAX_STRETCH = 5.0
     STATE: ClassVar[tuple[str, ...]] = ("_instant_ns", "_pose", "_twist", "_step_s", "_velocity")
     TRANSIENT: ClassVar[tuple[str, ...]] = ("_predicted",)
 
@@ -168,9 +170,7 @@ class ConstantVelocity(Stateful, MotionModel):
         if self._instant_ns is None or self._step_s <= 0:
             return self._pose.copy()
         if self._predicted is None or self._predicted[0] != stamp_ns:
-            # The speed after a long pause is unknown, unless all scans are so far apart.
-            seconds = min((stamp_ns - self._instant_ns) * 1e-9, max(PAUSE_S, self._step_s))
-            stretch = max(seconds / self._step_s, 0.0)
+            stretch = min(max((stamp_ns - self._instant_ns) * 1e-9 / self._step_s, 0.0), self.MAX_STRETCH)
             self._predicted = stamp_ns, se3.normalise(self._pose @ se3.exp(stretch * self._twist))
         return self._predicted[1].copy()
 
