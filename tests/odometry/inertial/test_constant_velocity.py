@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from lslam.core.geometry import se3
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Span
-from lslam.core.types.scan_result import MOST_ACCELERATION_M_S2, PAUSE_S
+from lslam.core.types.scan_result import MOST_ACCELERATION_M_S2
 from lslam.odometry.inertial.constant_velocity import ConstantVelocity
 
 TENTH = 100_000_000
@@ -55,17 +55,8 @@ def test_a_long_pause_is_not_stretched_beyond_reason() -> None:
     T = poses(2)
     motion.correct(0, T[0])
     motion.correct(TENTH, T[1])
-    np.testing.assert_allclose(motion.predict(1000 * TENTH), T[1] @ se3.exp(10 * PAUSE_S * TWIST), atol=1e-9)
+    np.testing.assert_allclose(motion.predict(1000 * TENTH), T[1] @ se3.exp(5.0 * TWIST), atol=1e-9)
     np.testing.assert_allclose(motion.predict(-1000 * TENTH), T[1], atol=1e-9)
-
-
-def test_scans_that_are_always_far_apart_are_predicted_as_far() -> None:
-    motion = ConstantVelocity()
-    T = poses(3)
-    motion.correct(0, T[0])
-    motion.correct(20 * TENTH, T[1])
-    for gap in (1, 100):
-        np.testing.assert_allclose(motion.predict(20 * (1 + gap) * TENTH), T[2], atol=1e-9)
 
 
 def test_equal_or_backward_stamps_keep_the_last_velocity() -> None:
