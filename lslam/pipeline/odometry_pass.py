@@ -150,10 +150,10 @@ def interpolate_gaps(results: list[ScanResult]) -> list[ScanResult]:
     stamps = np.array([r.stamp_ns for r in results], np.int64)
     out = list(results)
     for frame in np.unique(frames[frames >= 0]):
-        known = np.flatnonzero(frames == frame)
-        for i in np.flatnonzero(np.diff(known) > 1).tolist():
-            gap = [k for k in range(known[i] + 1, known[i + 1]) if frames[k] < 0 and results[k].frame == frame]
-            around = known[max(i - 1, 0) : i + 3]
+        anchors = np.flatnonzero(frames == frame)
+        for i in np.flatnonzero(np.diff(anchors) > 1).tolist():
+            gap = [k for k in range(anchors[i] + 1, anchors[i + 1]) if frames[k] < 0 and results[k].frame == frame]
+            around = anchors[max(i - 1, 0) : i + 3]
             if not gap or np.any(np.diff(stamps[around]) <= 0):
                 continue
             for k, pose in zip(gap, _course_through([results[k] for k in around], stamps[gap]), strict=True):

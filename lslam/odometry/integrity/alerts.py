@@ -39,12 +39,12 @@ def alerts(checks: list[MotionCheck], positions: Floats, stamps_ns: Longs, frame
     frames : (N,) in which the positions are given; None: all in one. From one frame to another nothing jumps.
     """
     rules = (_across_breaks, _inconsistent, _ambiguous, _open, _foreign)
-    found = [alert for rule in rules for alert in rule(checks)]
+    out = [alert for rule in rules for alert in rule(checks)]
     frames = np.zeros(len(positions), np.int64) if frames is None else frames
     for begin, end in pairwise([0, *(np.flatnonzero(np.diff(frames)) + 1).tolist(), len(frames)]):
         jumps = _jumps(positions[begin:end], stamps_ns[begin:end])
-        found += [Alert(begin + jump.first, begin + jump.last, jump.why) for jump in jumps]
-    return sorted(found, key=lambda alert: (alert.first, alert.last))
+        out += [Alert(begin + jump.first, begin + jump.last, jump.why) for jump in jumps]
+    return sorted(out, key=lambda alert: (alert.first, alert.last))
 
 
 def _inconsistent(checks: list[MotionCheck]) -> list[Alert]:
