@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from lslam.core.arrays import Floats
-from lslam.core.config.odometry import RecoveryConfig, RegistrationConfig
+from lslam.core.config.config import Config
+from lslam.core.config.odometry import RecoveryConfig
 from lslam.core.types.state import Stateful
 from lslam.odometry.feature_map import MIN_LINE_POINTS
 from lslam.odometry.feature_solver import remap_solution
@@ -30,7 +31,7 @@ class AllPoints(Stateful):
 
     STATE = ("_icp", "_fed")
 
-    def __init__(self, config: RegistrationConfig, voxel_size: float) -> None:
+    def __init__(self, config: Config, voxel_size: float) -> None:
         plain = {
             "residual": None,
             "target": "map",
@@ -38,9 +39,9 @@ class AllPoints(Stateful):
             "inlier_ratio": 1.0,
             "voxel_size": voxel_size,
         }
-        self._config = config.model_copy(update=plain)
+        self._config, self._preprocess = config.registration.model_copy(update=plain), config.preprocess
         # `icp` by default settings, updated from the first poorly constrained scan on.
-        self._icp = Registration(self._config)
+        self._icp = Registration(self._config, self._preprocess)
         self._fed = CONSTRAINED_SCANS
 
     def locate(self, attempt: Attempt) -> RegistrationResult:
@@ -94,7 +95,7 @@ class AllPoints(Stateful):
 
     def _of_recent(self, history: History) -> Registration:
         """A registration `icp` whose map has all points of the scans that were registered last."""
-        icp = Registration(self._config)
+        icp = Registration(self._config, self._preprocess)
         for points, T_world_lidar in history.recent:
             icp.update(RegistrationResult(T_world_lidar, points=prepare_points(points, icp.preprocess)))
         return icp

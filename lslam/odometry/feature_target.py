@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from lslam.core.arrays import Floats
 from lslam.core.config.config import Config
-from lslam.core.geometry import se3
 from lslam.odometry.feature_map import (
     FeatureKeyframes,
     FeatureMap,
@@ -29,16 +28,14 @@ from lslam.odometry.feature_solver import (
     solve_on_map,
     solve_on_scan,
 )
-from lslam.registration.attempt import Attempt, Target
-from lslam.registration.history import History, is_more
+from lslam.registration.attempt import RECOVER_M, Attempt, Target
+from lslam.registration.history import History
 from lslam.registration.optimiser import (
     COARSE_KERNEL_M,
     START_ITERATIONS,
     Annealing,
 )
-from lslam.registration.policies import MUCH_RATIO, START_STEP_M, start_offsets
 from lslam.registration.preprocessing.features import Features
-from lslam.registration.preprocessing.ground import up_of
 from lslam.registration.result import RegistrationResult
 from lslam.registration.voxel_target import MIN_SOURCE_POINTS
 
@@ -76,7 +73,9 @@ class FeatureTarget(Target):
         self.map = self._new_map(1 << 16) if variant.with_map else None
         self.scan: FeatureScan | None = None
         size = self._plane_size(self.config.voxel_size)
-        self.all_points = AllPoints(self.config, size) if config.recovery.fallback == "all-points" else None
+        # All points find the motion of the first scans, which too few features, or beams that repeat, leave open.
+        self._first_points = AllPoints(config, size) if config.recovery.start_search else None
+        self.all_points = AllPoints(config, size) if config.recovery.fallback == "all-points" else None
         self._keyframes = None if variant.keyframes is None else FeatureKeyframes(*variant.keyframes)
 
     def fresh(self) -> FeatureTarget:
@@ -111,12 +110,18 @@ class FeatureTarget(Target):
 
         The pose does not move along degenerate directions. `information` (6, 6) of the start joins the features of the map.
         """
-        assert self.scan is not None
-        features, noise, iterations, c = attempt.points, self.noise(attempt.history), 0, self.config
         if attempt.is_near:
             annealing = replace(annealing, steps=START_ITERATIONS)
         elif attempt.history.starting > 0:
-            annealing = replace(annealing, start=c.kernel_max)
+            annealing = replace(annealing, start=self.config.kernel_max)
+        return self._align(attempt, T_start, annealing, information)
+
+    def _align(
+        self, attempt: Attempt, T_start: Floats, annealing: Annealing, information: Floats | None = None
+    ) -> RegistrationResult:
+        """As `align`, with the kernel widths and steps of `annealing`."""
+        assert self.scan is not None
+        features, noise, iterations = attempt.points, self.noise(attempt.history), 0
         result = RegistrationResult(T_start, ok=False)
         if self.variant.scan_step is not None:
             align = partial(solve_on_scan, self.scan, annealing, noise, self.loam.matching == "one-to-many")
@@ -146,11 +151,19 @@ class FeatureTarget(Target):
     def capture(self, attempt: Attempt) -> RegistrationResult:
         """Align from a prior that may be metres off, and check the result.
 
-        Less planar points are registered on coarse planes first, then features as by `align`.
+        Points are registered first, then features as by `align`.
         """
         with attempt.clock.stage("start" if attempt.history.starting else "recover"):
-            attempt.start = self._start(attempt)
-        return attempt.judge(self.align(attempt, attempt.start.T_world_lidar, attempt.annealing))
+            start = attempt.start = self._start(attempt)
+        result = self.align(attempt, start.T_world_lidar, attempt.annealing)
+        if not (start.ok and self._first_points and attempt.is_young):
+            return attempt.judge(result)
+        # Of a first step, which may be of any length, all points know more than the prior.
+        judged = attempt.judge(result, start.T_world_lidar)
+        if not judged.ok or judged.prior_error[0] > RECOVER_M:
+            near = Annealing(RECOVER_M, START_ITERATIONS)
+            judged = attempt.judge(self._align(attempt, start.T_world_lidar, near), start.T_world_lidar)
+        return attempt.credit(judged, judged.pose_source)
 
     def on_planes(self, attempt: Attempt, T_start: Floats) -> RegistrationResult:
         """Align edges and centroids of less planar points with fine and coarse planes of the map, and check the result."""
@@ -176,32 +189,18 @@ class FeatureTarget(Target):
         return points.cloud
 
     def _start(self, attempt: Attempt) -> RegistrationResult:
-        """An initial guess for a prior that may be metres off: less planar points registered on coarse planes."""
-        c, history, T_prior = self.config, attempt.history, attempt.T_prior
-        if self.all_points is not None and attempt.is_young:
-            return self.all_points.locate(attempt)
+        """An initial guess for a prior that may be metres off: by all points on a young map, else by less planar ones.
+
+        Less planar points are registered on coarse planes.
+        """
+        if self._first_points is not None and attempt.is_young:
+            return self._first_points.locate(attempt)
         points, scatter = thin_planes(attempt.points)
-        target, noise = self._planes(), self.noise(history)
-
-        def on_coarse(start: Floats, width: float) -> RegistrationResult:
-            slow, levels = Annealing.slow(width), target.planes.coarser[:1]
-            return attempt.judge(solve_on_map(target, NONE, points, start, slow, noise, scatter=scatter, levels=levels))
-
-        def edges_at(result: RegistrationResult) -> int:
-            """How many of the less sharp edges lie on edges of the map; -1 where the registration failed."""
-            once, edges = Annealing.once(c.kernel_max / 2), attempt.points.less_edges.points
-            return solve_on_map(target, edges, NONE, result.T_world_lidar, once, noise).inliers if result.ok else -1
-
-        result = on_coarse(T_prior, COARSE_KERNEL_M)
-        if history.inserted > 1 or not self._whole.recovery.start_search:
-            return result
-        # Planes slide along a road; edges repeat nowhere at once. Few of them decide nothing: two sigma of what is counted.
-        offsets = start_offsets(c.start_reach, START_STEP_M, up_of(self._whole.preprocess))
-        trials = [on_coarse(T_prior @ se3.make(np.eye(3), offset), 2 * START_STEP_M) for offset in offsets]
-        agree = [edges_at(one) for one in trials]
-        most, usual = max(agree, default=0), max(edges_at(result), 0)
-        is_clear = most > MUCH_RATIO * usual and is_more(most, usual)
-        return trials[int(np.argmax(agree))] if is_clear else result
+        target, noise, slow = self._planes(), self.noise(attempt.history), Annealing.slow(COARSE_KERNEL_M)
+        coarse = target.planes.coarser[:1]
+        return attempt.judge(
+            solve_on_map(target, NONE, points, attempt.T_prior, slow, noise, scatter=scatter, levels=coarse)
+        )
 
     def _planes(self) -> FeatureMap:
         """The feature map; without one, a map of the last scan alone."""

@@ -233,7 +233,7 @@ class CoarseToFine:
 
     Fine registration alone loses a start above 0.7 m per scan: its kernel opens no wider than its voxels.
 
-    of_features : features are few: their share says nothing, and at the start they need a consensus that is larger by two sigma
+    of_features : features are few: their share says nothing, and at the start neither does their number
     """
 
     of_features: bool = False
@@ -250,12 +250,11 @@ class CoarseToFine:
             return result
         coarse: RegistrationResult = attempt.target.capture(attempt)
         iterations = result.iterations + coarse.iterations
-        # Forty steps that lead nowhere are no consensus; the ten of a usual scan may end a millimetre short of it.
-        is_consensus = result.ok and (self.of_features or result.converged or is_started)
-        is_larger = coarse.inliers > result.inliers
-        if self.of_features and not is_started:
-            is_larger = not is_more(result.inliers, coarse.inliers)
-        is_better = coarse.ok and (not is_consensus or is_larger)
+        # Forty steps that lead nowhere are no consensus; the ten of a usual scan may end a millimetre short of it. On a young map
+        # all points, of which the coarse alignment came, know more than features: rings repeat best where the sensor stands.
+        is_telling = not attempt.is_young if self.of_features else result.converged
+        is_consensus = result.ok and (is_started or is_telling)
+        is_better = coarse.ok and (not is_consensus or coarse.inliers > result.inliers)
         if is_certain:
             # What hides part of the map, as a crowd does, hides it from both.
             is_better = is_better and not usual.is_less(coarse.agreement)

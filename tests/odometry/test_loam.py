@@ -266,13 +266,15 @@ def test_options_act_as_they_are_named() -> None:
     assert len(fine.loam.registration.map) > 2 * len(wide.loam.registration.map)
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_a_first_step_of_nine_metres_is_found(method: str) -> None:
+@pytest.mark.parametrize(
+    ("method", "fallback"), [*((method, "all-points") for method in METHODS), ("loam", "none"), ("lego-loam", "none")]
+)
+def test_a_first_step_of_nine_metres_is_found(method: str, fallback: str) -> None:
     scans, truth = street(0, "os1-32", 13, speed=10.0)
-    driver = Driver(method, fallback="all-points")
+    driver = Driver(method, fallback=fallback)
     driver.feed(scans[0])
     assert metres(driver.feed(scans[9]), truth[9]) < 0.1
-    blind = Driver(method, start_reach=0.0, fallback="all-points")
+    blind = Driver(method, start_reach=0.0, fallback=fallback)
     blind.feed(scans[0])
     assert metres(blind.feed(scans[9]), truth[9]) > 1.0
 
@@ -286,13 +288,20 @@ def of_motorway(seed: int, lidar: str, count: int, speed: float | None = None) -
 
 
 @pytest.mark.parametrize(
-    ("method", "seed", "lidar"),
-    [("loam-odom", 1, "os1-16"), ("loam", 1, "vlp16"), ("floam", 0, "os1-16"), ("lego-loam", 0, "os1-16")],
-)
-def test_a_start_at_thirty_metres_a_second_is_followed_with_sixteen_beams(method: str, seed: int, lidar: str) -> None:
+    ("method", "seed", "lidar", "fallback"),
+    [
+        ("loam-odom", 1, "os1-16", "all-points"), ("loam", 1, "vlp16", "all-points"),
+        ("floam", 0, "os1-16", "all-points"), ("lego-loam", 0, "os1-16", "all-points"),
+        ("loam-odom", 1, "vlp16", "none"), ("loam", 1, "vlp16", "none"),
+        ("floam", 0, "vlp16", "none"), ("lego-loam", 0, "os1-16", "none"),
+    ],
+)  # fmt: skip
+def test_a_start_at_thirty_metres_a_second_is_followed_with_sixteen_beams(
+    method: str, seed: int, lidar: str, fallback: str
+) -> None:
     """Planar points of so few rings lie on the road and slide with it, by all of the 3 m a scan."""
     scans, truth = of_motorway(seed, lidar, 4)
-    for result, true in zip(Driver(method, fallback="all-points").drive(scans), truth, strict=True):
+    for result, true in zip(Driver(method, fallback=fallback).drive(scans), truth, strict=True):
         assert result.status == "ok"
         assert metres(result, true) < 0.8
 
@@ -324,8 +333,7 @@ def test_all_points_register_scans_with_poorly_constraining_features() -> None:
     held = np.concatenate([off(seed, "all-points") for seed in range(4)])
     assert np.median(held) < 0.03
     assert np.quantile(held, 0.7) < 0.1
-    # They slide by nearly all of the 3 m.
-    assert np.median(off(1, "none")) > 4 * np.max(held)
+    assert np.median(off(3, "none")) > 4 * np.median(off(3, "all-points"))
 
 
 def test_a_resumed_start_has_its_non_ground_points() -> None:
@@ -368,7 +376,7 @@ def test_features_pose_every_scan_by_themselves(method: str) -> None:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_edges_find_a_start_at_thirty_metres_a_second(method: str) -> None:
+def test_a_start_at_thirty_metres_a_second_is_found(method: str) -> None:
     """Planar points slide along the road by all of the 3 m a scan; without the search they do."""
     scans, truth = of_motorway(2, "hdl64", 5, 30.0)
     found, blind = (Driver(method, start_reach=reach).drive(scans) for reach in (12.0, 0.0))
@@ -377,7 +385,7 @@ def test_edges_find_a_start_at_thirty_metres_a_second(method: str) -> None:
     assert {r.posed_by for r in found} <= {"", LessPlanar.name}
 
 
-def test_two_matching_edges_do_not_support_a_start() -> None:
+def test_a_start_on_one_scan_of_sixteen_beams_is_found() -> None:
     """One scan of sixteen beams makes hardly a line: where two edges agree, not one, is no place."""
     scans, truth = street(100, "vlp16", 6, speed=12.0)
     for result, true in zip(Driver("loam").drive(scans), truth, strict=True):
