@@ -17,8 +17,8 @@ from lslam.registration.result import RegistrationResult
 
 
 def create(config: Config) -> Dlo:
-    """Create the method from the configuration; its only recovery is the second registration."""
-    return Dlo(registration_of(config, "gicp", NO_RECOVERY, target="submap"))
+    """Create the method from the configuration; but for the search of the first steps its recovery is the second registration."""
+    return Dlo(registration_of(config, "gicp", NO_RECOVERY, target="submap"), config.recovery.start_search)
 
 
 class Dlo(Icp):
@@ -26,10 +26,11 @@ class Dlo(Icp):
 
     STATE = (*Icp.STATE, "pairwise")
 
-    def __init__(self, registration: Registration) -> None:
+    def __init__(self, registration: Registration, start_search: bool) -> None:
         super().__init__(registration)
         c = registration.config.model_copy(update={"target": "scan"})
-        self.pairwise = Registration(c, registration.preprocess, NO_RECOVERY)
+        search_alone = NO_RECOVERY.model_copy(update={"start_search": start_search})
+        self.pairwise = Registration(c, registration.preprocess, search_alone)
 
     def register(
         self, scan: Scan, prepared: PreparedPoints, prior: MotionPrior, is_near: bool = False

@@ -17,8 +17,8 @@ from lslam.simulation.scenarios import SimulatedDrive, simulate
 COUNT = 40
 
 
-def dlo() -> Dlo:
-    method = create_odometry(load_config(None, ["odometry.method=dlo"], {}))
+def dlo(*settings: str) -> Dlo:
+    method = create_odometry(load_config(None, ["odometry.method=dlo", *settings], {}))
     assert isinstance(method, Dlo)
     return method
 
@@ -63,3 +63,14 @@ def test_the_submap_corrects_what_the_last_scan_alone_gives() -> None:
     settings = ["odometry.method=gicp", "registration.target=scan"]
     alone = error_of(list(estimate(drive(), create_odometry(load_config(None, settings, {})))), true_poses())
     assert both < alone
+
+
+def test_a_start_at_thirty_metres_a_second_is_found_by_the_search() -> None:
+    motorway = simulate(
+        "motorway", seed=1, lidar="hdl64", count=5, speed=30.0, start_speed=30.0, motion_compensated=True
+    )
+    truth = motorway.ground_truth
+    assert truth is not None
+    found, blind = (list(estimate(motorway, dlo(f"recovery.start_search={word}"))) for word in ("true", "false"))
+    assert error_of(found, truth.poses) < 0.1
+    assert error_of(blind, truth.poses) > 5.0
