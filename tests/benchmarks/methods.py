@@ -1,9 +1,9 @@
 """Every method on simulated drives: ATE se3, scans that a recovery policy or the motion prior posed, runs that were doubted.
 
-    python tests/benchmarks/methods.py [--scenarios urban,street] [--methods icp,loam+recovery.fallback=all-points]
+    python tests/benchmarks/methods.py [--scenarios urban,motorway:vlp16] [--methods icp,loam+recovery.fallback=all-points]
         [--seeds 100-104] [--scans 60] [--write docs/results.md]
 
-Each method in its default, but for the keys that follow its name. Sensors are the scenarios' own.
+Each method in its default, but for the keys that follow its name. Sensors are the scenarios' own, or follow their names.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from traced import Traced, run_on, traced
 from lslam.core.errors import LslamError
 
 METHODS = (
-    "icp,icp-point,gicp,vgicp,ndt,icp-svd,loam-odom,loam,loam+recovery.fallback=all-points,floam,lego-loam,"
+    "icp,icp-point,gicp,vgicp,ndt,icp-svd,dlo,loam-odom,loam,loam+recovery.fallback=all-points,floam,lego-loam,"
     "kiss-icp,small-gicp"
 )
 
@@ -46,7 +46,7 @@ def cell(found: list[tuple[float, int, str]]) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenarios", default="urban,street,carpark,motorway")
+    parser.add_argument("--scenarios", default="urban,street,carpark,motorway,motorway:vlp16")
     parser.add_argument("--methods", default=METHODS)
     parser.add_argument("--scans", type=int, default=60)
     tables.offer(parser)
@@ -57,7 +57,8 @@ def main() -> None:
     sensors = {}
     for scenario in scenarios:
         for seed in seeds:
-            drive = traced(scenario, seed, count=args.scans)
+            name, _, lidar = scenario.partition(":")
+            drive = traced(name, seed, count=args.scans, lidar=lidar or None)
             sensors[scenario] = drive.lidar.name
             for method in methods:
                 one = judged(drive, method)
@@ -68,7 +69,7 @@ def main() -> None:
         "runs that a recovery policy, all points or the motion prior posed in place of the method, and runs that said "
         "`degraded`."
     )
-    header = ["method", *(f"{scenario}, {sensors[scenario]}" for scenario in scenarios)]
+    header = ["method", *(f"{scenario.partition(':')[0]}, {sensors[scenario]}" for scenario in scenarios)]
     rows = [[method, *(cell(found[method, scenario]) for scenario in scenarios)] for method in methods]
     tables.table("methods", caption, header, rows, args.write)
 
