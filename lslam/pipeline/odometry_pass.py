@@ -123,7 +123,7 @@ def estimate_poses(job: PreparedRun) -> RunRecord:
     manifest.judge(results, len(sequence), diverges(results))
     checks = [] if monitor is None else checks_within(monitor.checks, results)
     if monitor is not None:
-        results = raise_alerts(results, checks, manifest)
+        results = raise_alerts(results, checks, manifest, are_scans_alone=motion is None)
     return RunRecord(
         name=sequence.name,
         method=config.odometry.method,

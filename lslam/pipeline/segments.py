@@ -18,7 +18,7 @@ from lslam.core.config import Config
 from lslam.core.geometry import noise, se3
 from lslam.core.types.scan_result import MOST_ACCELERATION_M_S2, MotionCheck, ScanResult, motion_apart
 from lslam.core.types.trajectory import Keyframe, Segment
-from lslam.odometry.integrity.alerts import LARGE, Alert, alerts, stamp_faults
+from lslam.odometry.integrity.alerts import LARGE, Alert, alerts, open_throughout, stamp_faults
 from lslam.pipeline.manifest import Manifest
 
 log = logging.getLogger("lslam")
@@ -237,10 +237,17 @@ def _sentence(segment: Segment) -> str:
     return ""
 
 
-def raise_alerts(results: list[ScanResult], checks: list[MotionCheck], manifest: Manifest) -> list[ScanResult]:
-    """Results with the scans that the integrity monitor contradicts marked lost; the manifest gets a problem for each stretch."""
+def raise_alerts(
+    results: list[ScanResult], checks: list[MotionCheck], manifest: Manifest, are_scans_alone: bool = True
+) -> list[ScanResult]:
+    """Results with the scans that the integrity monitor contradicts marked lost; the manifest gets a problem for each stretch.
+
+    are_scans_alone : whether nothing else, as an IMU or wheels, tells the motion where the scans leave it open
+    """
     positions, stamps_ns, frames = _positions(results)
     stretches = alerts(checks, positions, stamps_ns, frames)
+    if are_scans_alone and not stretches:
+        stretches = open_throughout(checks)
     _check_stamps(results, positions, stamps_ns)
     manifest.integrity = {
         "checks": len(checks),

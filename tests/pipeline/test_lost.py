@@ -169,6 +169,14 @@ def test_clouds_in_the_frame_of_a_world_are_reported() -> None:
     assert "the clouds are not in the frame of the sensor" in problem
 
 
+def test_a_bare_tunnel_is_reported_though_the_method_holds_still() -> None:
+    """Rings hold points on points: the method sees no direction that is open."""
+    outcome = ended(drive("tunnel", 40), "odometry.method=icp-svd")
+    assert outcome.record.manifest["status"] == "degraded"
+    (problem,) = problems(outcome)
+    assert "nothing confirms the poses" in problem
+
+
 @pytest.mark.parametrize("lidar", ["vlp16", "hdl64"])
 def test_three_missing_seconds_while_moving_degrade_the_run(lidar: str) -> None:
     whole = drive("street", lidar=lidar)

@@ -174,6 +174,14 @@ def _open(checks: list[MotionCheck]) -> list[Alert]:
     ]
 
 
+def open_throughout(checks: list[MotionCheck]) -> list[Alert]:
+    """The alert of a run of which no two scans tell the motion, as in a bare tunnel: standing there looks like any speed."""
+    if len(checks) < IN_A_ROW or not all(check.is_open for check in checks):
+        return []
+    why = "no two scans tell how the sensor moved, as in a bare tunnel: nothing confirms the poses"
+    return [Alert(checks[0].first + 1, checks[-1].last, why)]
+
+
 def _is_rest(motion: Floats) -> bool:
     """Whether a motion (4, 4) is too small to count as motion."""
     return is_within(motion, SAME_M)

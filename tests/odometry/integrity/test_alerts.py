@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lslam.core.geometry import se3, so3
 from lslam.core.types.scan_result import MotionCheck
-from lslam.odometry.integrity.alerts import IN_A_ROW, alerts, stamp_faults
+from lslam.odometry.integrity.alerts import IN_A_ROW, alerts, open_throughout, stamp_faults
 
 Floats = NDArray[np.float64]
 
@@ -86,6 +86,15 @@ def test_standing_that_explains_as_much_as_moving_raises_an_alert_when_it_does_s
     assert spans([*checks[:3], replace(checks[3], rival=still), *checks[4:]]) == []
     assert spans([*checks[:3], *(replace(check, rival=on) for check in checks[3:6]), *checks[6:]]) == []
     assert spans([*checks[:3], *(replace(check, rival=still) for check in checks[3:5]), *checks[5:]]) == [(16, 25)]
+
+
+def test_a_run_of_which_no_two_scans_tell_the_motion_raises_an_alert() -> None:
+    ahead = np.array([1.0, 0.01, 0.01, *SURE[3:]])
+    checks = [replace(check, sigma=ahead) for check in checks_of([0.0] * IN_A_ROW)]
+    (alert,) = open_throughout(checks)
+    assert (alert.first, alert.last) == (1, 5 * IN_A_ROW)
+    assert open_throughout(checks[1:]) == []
+    assert open_throughout([*checks, *checks_of([0.0])]) == []
 
 
 def test_poses_that_begin_to_move_where_the_scans_leave_it_open_raise_an_alert() -> None:
