@@ -85,6 +85,10 @@ class FeatureTarget(Target):
     def __len__(self) -> int:
         return 0 if self.scan is None else len(self.scan.features.less_planes) + len(self.scan.features.less_edges)
 
+    def begins_by_points(self, attempt: Attempt) -> bool:
+        """Whether all points of the scan say where it begins: on a young map, where the start search is on."""
+        return self._first_points is not None and attempt.is_young
+
     def count(self, points: Features) -> int:
         """Number of edges and planar points."""
         return len(points.edges) + len(points.planes)
@@ -156,7 +160,7 @@ class FeatureTarget(Target):
         with attempt.clock.stage("start" if attempt.history.starting else "recover"):
             start = attempt.start = self._start(attempt)
         result = self.align(attempt, start.T_world_lidar, attempt.annealing)
-        if not (start.ok and self._first_points and attempt.is_young):
+        if not (start.ok and self.begins_by_points(attempt)):
             return attempt.judge(result)
         # Of a first step, which may be of any length, all points know more than the prior.
         judged = attempt.judge(result, start.T_world_lidar)

@@ -250,9 +250,9 @@ class CoarseToFine:
             return result
         coarse: RegistrationResult = attempt.target.capture(attempt)
         iterations = result.iterations + coarse.iterations
-        # Forty steps that lead nowhere are no consensus; the ten of a usual scan may end a millimetre short of it. On a young map
-        # all points, of which the coarse alignment came, know more than features: rings repeat best where the sensor stands.
-        is_telling = not attempt.is_young if self.of_features else result.converged
+        # Forty steps that lead nowhere are no consensus; the ten of a usual scan may end a millimetre short of it. Where all
+        # points began the coarse alignment, they know more than features: rings repeat best where the sensor stands.
+        is_telling = not attempt.target.begins_by_points(attempt) if self.of_features else result.converged
         is_consensus = result.ok and (is_started or is_telling)
         is_better = coarse.ok and (not is_consensus or coarse.inliers > result.inliers)
         if is_certain:

@@ -386,7 +386,7 @@ def test_a_start_at_thirty_metres_a_second_is_found(method: str) -> None:
 
 
 def test_a_start_on_one_scan_of_sixteen_beams_is_found() -> None:
-    """One scan of sixteen beams makes hardly a line: where two edges agree, not one, is no place."""
+    """One scan of sixteen beams makes hardly a line, so that few edges find another."""
     scans, truth = street(100, "vlp16", 6, speed=12.0)
     for result, true in zip(Driver("loam").drive(scans), truth, strict=True):
         assert metres(result, se3.relative(truth[0], true)) < 0.05
