@@ -86,7 +86,8 @@ def estimate_poses(job: PreparedRun) -> RunRecord:
 
     watch.on_start("odometry", len(sequence) - (0 if checkpoints is None else checkpoints.scans))
     inertial = _begin_imu(job)
-    motion = job.odometry.motion if isinstance(job.odometry, GivenPoses) else job.wheels.motion or inertial.motion
+    given_speed = job.odometry.motion if isinstance(job.odometry, GivenPoses) else job.wheels.motion
+    motion = given_speed or inertial.motion
     with manifest.time("odometry_s"), Keyframing(store, config) as keyframing:
         results = estimate(
             sequence,
@@ -123,7 +124,7 @@ def estimate_poses(job: PreparedRun) -> RunRecord:
     manifest.judge(results, len(sequence), diverges(results))
     checks = [] if monitor is None else checks_within(monitor.checks, results)
     if monitor is not None:
-        results = raise_alerts(results, checks, manifest, are_scans_alone=motion is None)
+        results = raise_alerts(results, checks, manifest, are_scans_alone=given_speed is None)
     return RunRecord(
         name=sequence.name,
         method=config.odometry.method,

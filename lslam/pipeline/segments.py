@@ -242,7 +242,7 @@ def raise_alerts(
 ) -> list[ScanResult]:
     """Results with the scans that the integrity monitor contradicts marked lost; the manifest gets a problem for each stretch.
 
-    are_scans_alone : whether nothing else, as an IMU or wheels, tells the motion where the scans leave it open
+    are_scans_alone : whether nothing else, as wheels, tells the speed; an IMU tells its changes alone
     """
     positions, stamps_ns, frames = _positions(results)
     stretches = alerts(checks, positions, stamps_ns, frames)

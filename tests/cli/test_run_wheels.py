@@ -29,6 +29,8 @@ def test_they_carry_through_a_tunnel_and_threads_change_nothing(tunnel: Path, tm
     assert "  wheels       used; no scan with surfaces along the way told their scale" in done.stdout
     alone = lslam(*words, "--out", tmp_path / "alone")
     assert alone.returncode == 0, alone.stderr
+    assert "nothing confirms the poses" in alone.stdout
+    assert "nothing confirms the poses" not in done.stdout
     ways = [float(line.split()[1]) for line in (tmp_path / "alone" / "trajectory.tum").read_text().splitlines()[-1:]]
     ways += [float(line.split()[1]) for line in trajectories[0].decode().splitlines()[-1:]]
     true = manifest(tunnel / "sequences" / "00")["length_m"]
